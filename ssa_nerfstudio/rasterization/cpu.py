@@ -1,0 +1,139 @@
+"""The rasterizer for machines without CUDA: numba, forward and hand-written backward, deterministic for any thread count."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.rasterization import _kernels
+from ssa_nerfstudio.rasterization.constants import TILE
+from ssa_nerfstudio.rasterization.interface import rasterization_with
+from ssa_nerfstudio.rasterization.projection import Splats
+
+_pool: ThreadPoolExecutor | None = None
+
+
+def blend(
+    splats: Splats, means2d: Tensor, camera: int, width: int, height: int, absgrad: bool
+) -> tuple[Tensor, Tensor]:
+    """Blend one camera's splats, front to back. See `interface.Blend`; float32 or float64."""
+    return _Blend.apply(
+        means2d, splats.conics, splats.opacities, splats.colors, splats.ids, splats.radii, camera, width, height, absgrad
+    )  # pyright: ignore[reportReturnType]
+
+
+rasterization = rasterization_with(blend)
+
+
+def compile_kernels() -> None:
+    """Compile (or load from numba's cache) the float32 kernels, so that the first frame does not wait for it.
+
+    Has to run before nerfstudio's viewer does: it renders in a thread under `sys.settrace` that raises at arbitrary
+    lines, in the middle of a compilation too.
+    """
+    one = torch.ones(1, 3, requires_grad=True)
+    viewmat = torch.eye(4)[None]
+    viewmat[0, 2, 3] = 2.0
+    image, _, _ = rasterization(
+        one - 1, torch.eye(4)[:1], 0.1 * one, one[:, 0], one, viewmat, torch.eye(3)[None], 1, 1, absgrad=True
+    )
+    image.sum().backward()
+
+
+class _Blend(torch.autograd.Function):
+    """Autograd's door to the kernels; gradients of the centres arrive at the whole `means2d` [C, N, 2]."""
+
+    @staticmethod
+    def forward(ctx, means2d, conics, opacities, colors, ids, radii, camera, width, height, absgrad):  # pyright: ignore
+        centres = np.ascontiguousarray(means2d.detach()[camera, ids].numpy())
+        arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (conics, opacities, colors)]
+        bounds = _tile_bounds(centres, radii.numpy(), width, height)
+        bands = _kernels.assign_bands(bounds, -(-height // TILE))
+        image = np.zeros((height, width, 4), centres.dtype)
+        transmittance = np.ones((height, width), centres.dtype)
+        last = np.zeros((height, width), np.int32)
+        starts, members, _ = bands
+        _on_all_threads(_kernels.blend_bands, starts, members, centres, *arrays, bounds, image, transmittance, last)
+        ctx.save_for_backward(means2d, ids)
+        ctx.blended = (bands, centres, arrays, bounds, transmittance, last)
+        ctx.camera, ctx.absgrad = camera, absgrad
+        return torch.from_numpy(image), torch.from_numpy(1 - transmittance[..., None])
+
+    @staticmethod
+    def backward(ctx, v_image, v_alpha):  # pyright: ignore[reportIncompatibleMethodOverride]
+        means2d, ids = ctx.saved_tensors
+        (starts, members, slots), centres, arrays, bounds, transmittance, last = ctx.blended
+        partial = np.zeros((len(members), _kernels.GRADIENTS), np.float64)
+        _on_all_threads(
+            _kernels.backpropagate_bands,
+            starts,
+            members,
+            slots,
+            centres,
+            *arrays,
+            bounds,
+            transmittance,
+            last,
+            v_image.contiguous().numpy(),
+            v_alpha[..., 0].contiguous().numpy(),
+            partial,
+        )
+        total = np.empty((len(centres), _kernels.GRADIENTS), centres.dtype)
+        _kernels.sum_partials(slots, partial, total)
+        v = torch.from_numpy(total)
+        v_means2d = torch.zeros_like(means2d)
+        v_means2d[ctx.camera, ids] = v[:, 0:2]
+        if ctx.absgrad:
+            # gsplat's contract with its DefaultStrategy; several cameras add up, each in rows of its own.
+            if not hasattr(means2d, "absgrad"):
+                means2d.absgrad = torch.zeros_like(means2d)
+            means2d.absgrad[ctx.camera, ids] = v[:, 2:4]
+        return v_means2d, v[:, 4:7], v[:, 7], v[:, 8:12], None, None, None, None, None, None
+
+
+def _tile_bounds(centres: np.ndarray, radii: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Pixel bounds x0, x1, y0, y1 [V, 4] int32 of the tiles that each splat's three-sigma square touches."""
+    size = np.array([width, height])
+    tiles = -(-size // TILE)
+    lower = np.clip(np.floor((centres - radii[:, None]) / TILE), 0, tiles)
+    upper = np.clip(np.ceil((centres + radii[:, None]) / TILE), 0, tiles)
+    bounds = np.empty((len(centres), 4), np.int32)
+    bounds[:, 0::2] = lower * TILE
+    bounds[:, 1::2] = np.minimum(upper * TILE, size)
+    return bounds
+
+
+def _on_all_threads(kernel: Callable, *arguments) -> None:
+    """Run `kernel(t, threads, *arguments)` for every thread t; the kernel releases the GIL.
+
+    A pool of Python threads rather than numba's `prange`: its threading layers allow no concurrent calls from the
+    viewer's and the trainer's threads everywhere, and OpenMP's spinning barriers stall when cores are shared.
+    """
+    threads = torch.get_num_threads()
+    if threads == 1:
+        kernel(0, 1, *arguments)
+        return
+    jobs = [_executor().submit(kernel, t, threads, *arguments) for t in range(1, threads)]
+    kernel(0, threads, *arguments)
+    for job in jobs:
+        job.result()
+
+
+def _executor() -> ThreadPoolExecutor:
+    global _pool
+    if _pool is None:
+        _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="ssa-blend")
+    return _pool
+
+
+def _forget_pool() -> None:
+    global _pool
+    _pool = None
+
+
+os.register_at_fork(after_in_child=_forget_pool)
