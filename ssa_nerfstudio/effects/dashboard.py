@@ -61,7 +61,7 @@ class Dashboard:
         """
         painter = _Painter(height, width, self.height * height)
         x, y = painter.x, painter.y
-        # Distances are in units of the dashboard's height, y upwards from the frame's lower edge, x from its middle.
+        # Distances are in the dashboard's height, y upwards from the frame's lower edge, x from its middle.
         driver = -0.2 * painter.aspect
         crest = 0.80 - 0.20 * (x / painter.aspect * 2) ** 2
         hood = 1 - 0.5 * np.abs((x - driver) / 1.15) ** 3.2
@@ -75,7 +75,7 @@ class Dashboard:
         painter.paint(self.cluster_colour, np.abs(y - crest + 0.42) - 0.014, opacity=0.8)
 
         painter.paint(self.cluster_colour, _rounded_box(x - driver, y - 0.43, 1.02, 0.44, 0.3))
-        for offset, tilt in zip((-0.47, 0.47), rng.uniform(-0.6, 0.6, 2), strict=True):
+        for offset, tilt in zip((-0.47, 0.47), rng.uniform(-0.45, 0.45, 2), strict=True):
             self._paint_gauge(painter, driver + offset, tilt * np.pi)
 
         right = 0.16 * painter.aspect
@@ -86,7 +86,7 @@ class Dashboard:
         vent = _rounded_box(x - 0.37 * painter.aspect, y - 0.34, 0.34, 0.17, 0.06)
         painter.paint(self.cluster_colour, np.maximum(vent, 0.03 - np.abs((y - 0.34) % 0.11 - 0.055)))
 
-        radius = np.hypot(x - driver, (y + 0.95) * 0.96)
+        radius = np.hypot(x - driver, (y + 1.04) * 0.96)
         painter.paint(self.wheel_colour, np.abs(radius - 1.42) - 0.1)
         painter.paint(self.dial_colour, np.abs(radius - 1.475) - 0.012, opacity=0.35)
 
@@ -114,8 +114,9 @@ class _Painter:
     def __init__(self, height: int, width: int, unit: float) -> None:
         """A black canvas [height, width, 3] whose unit of length is `unit` pixels."""
         self.unit = unit
-        self.aspect = width / unit
-        self.x = ((np.arange(width) + 0.5 - width / 2) / unit)[None, :]
+        # A frame too narrow for cluster, screen and vent squeezes them.
+        self.aspect = max(width / unit, 4.4)
+        self.x = ((np.arange(width) + 0.5) / width - 0.5)[None, :] * self.aspect
         self.y = ((height - np.arange(height) - 0.5) / unit)[:, None]
         self.colour = np.zeros((height, width, 3))
 

@@ -1,0 +1,146 @@
+"""The artifact as a picture in front of every view: parameters, matte, compositing (paper, section "Modeling screen-space artifacts")."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from ssa_nerfstudio.overlay.resampling import (
+    letterbox,
+    reduced_size,
+    stack_premultiplied,
+    straight_color,
+    to_training_scale,
+)
+from ssa_nerfstudio.overlay.statistics import ImageStatistics
+
+STATISTICS_SCALE = 0.05
+"""s of the paper: a pixel whose standard deviation over the views is s starts with a matte of 1 / e."""
+CONSTANT_START = (0.5, 0.1)
+"""Colour and matte of the paper's ablation "constant start"."""
+MATTE_START_RANGE = (0.01, 0.99)
+"""The starting matte is clamped to this before the logit: exp(-sigma / s) is exactly 1 where sigma is 0."""
+COLOR_START_RANGE = (1 / 510, 1 - 1 / 510)
+"""The starting colour is clamped to this before the logit: half a grey level from black and white."""
+
+
+def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
+    """Put an artifact in front of a render: I = T C + B (equation "composition" with T = 1 - A, B = A W).
+
+    Args:
+        clean: [H, W, 3] in [0, 1].
+        transmittance: [H, W, 1] or [H, W, 3] in [0, 1].
+        addition: [H, W, 3], not negative.
+    """
+    return transmittance * clean + addition
+
+
+class ScreenSpaceOverlay(nn.Module):
+    """A learnable RGBA image shared by all views of one camera: W = sigmoid(W~), A = sigmoid(A~), one per pixel."""
+
+    def __init__(self, height: int, width: int, resolution: int = 1) -> None:
+        """Make an overlay for a frame, with the paper's constant start.
+
+        Args:
+            height, width: the camera's frame in pixels (undistorted).
+            resolution: 1, 2 or 4: the overlay holds one pixel for a block of this side.
+        """
+        super().__init__()
+        size = reduced_size(height, width, resolution)
+        color, alpha = CONSTANT_START
+        self.color_logits = nn.Parameter(torch.full((*size, 3), color).logit())
+        self.alpha_logits = nn.Parameter(torch.full((*size, 1), alpha).logit())
+        self.register_buffer("frame", torch.tensor([height, width, resolution]))
+        self.register_buffer("evidence", torch.ones(*size, 1))
+        self.height, self.width, self.resolution = height, width, resolution
+
+    @torch.no_grad()
+    def start_from(self, statistics: ImageStatistics) -> None:
+        """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05); sigma also weighs the sparsity.
+
+        Raises:
+            ValueError: where the statistics are of another frame.
+        """
+        if statistics.size != (self.height, self.width):
+            raise ValueError(f"statistics of a frame {statistics.size} for an overlay of {(self.height, self.width)}")
+        mean, deviation = statistics.mean(), statistics.deviation()
+        alpha = torch.exp(-deviation / STATISTICS_SCALE)
+        transmittance, addition = stack_premultiplied(mean, alpha)
+        pair = torch.cat([transmittance, addition, deviation], dim=-1).to(self.alpha_logits)
+        size = self.alpha_logits.shape[:2]
+        if self.resolution > 1:
+            padded = nn.functional.pad(
+                pair.permute(2, 0, 1)[None],
+                (0, size[1] * self.resolution - self.width, 0, size[0] * self.resolution - self.height),
+                mode="replicate",
+            )
+            pair = nn.functional.avg_pool2d(padded, self.resolution)[0].permute(1, 2, 0)
+        color, alpha = straight_color(pair[..., :1], pair[..., 1:4])
+        self.color_logits.copy_(color.clamp(*COLOR_START_RANGE).logit())
+        self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
+        self.evidence.copy_(_evidence(pair[..., 4:]))
+
+    def color(self) -> Tensor:
+        """W: straight colour [h, w, 3] in (0, 1)."""
+        return torch.sigmoid(self.color_logits)
+
+    def matte(self) -> Tensor:
+        """A: opacity [h, w, 1] in (0, 1)."""
+        return torch.sigmoid(self.alpha_logits)
+
+    def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
+        """Transmittance [H // reduction, W // reduction, 1] and added light [..., 3], averaged premultiplied.
+
+        Args:
+            reduction: 1, 2 or 4: training images are reduced by this.
+        """
+        transmittance, addition = stack_premultiplied(self.color(), self.matte())
+        if self.resolution == reduction == 1:
+            return transmittance, addition
+        pair = torch.cat([transmittance, addition], dim=-1)
+        pair = to_training_scale(pair, self.resolution, reduction, self.height, self.width)
+        return pair[..., :1], pair[..., 1:]
+
+
+class GivenOverlay(nn.Module):
+    """The true artifact, known and not learned: I = clip(T C + B), T per channel. The reference of every benchmark."""
+
+    def __init__(self, transmittance: Tensor, addition: Tensor) -> None:
+        """Take T and B [H, W, 3] of the undistorted frame.
+
+        Raises:
+            ValueError: for shapes other than [H, W, 3], values that are not finite, or T outside [0, 1].
+        """
+        super().__init__()
+        if transmittance.dim() != 3 or transmittance.shape[2] != 3 or transmittance.shape != addition.shape:
+            shapes = tuple(transmittance.shape), tuple(addition.shape)
+            raise ValueError(f"T and B must both be [H, W, 3], they are {shapes[0]} and {shapes[1]}")
+        if not (torch.isfinite(transmittance).all() and torch.isfinite(addition).all()):
+            raise ValueError("T or B holds values that are not finite")
+        if transmittance.min() < 0 or transmittance.max() > 1:
+            raise ValueError("T must lie in [0, 1]")
+        self.register_buffer("transmittance", transmittance.float())
+        self.register_buffer("addition", addition.float())
+        self.height, self.width = transmittance.shape[:2]
+
+    def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
+        """T and B [H // reduction, W // reduction, 3], averaged."""
+        return (
+            to_training_scale(self.transmittance, 1, reduction, self.height, self.width),
+            to_training_scale(self.addition, 1, reduction, self.height, self.width),
+        )
+
+
+def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """An overlay's layers in a frame of any size and aspect: scaled, centred, never stretched; clear around it."""
+    transmittance, addition = overlay.layers()
+    return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
+
+
+def _evidence(deviation: Tensor) -> Tensor:
+    """r = min(1, sigma / 70th percentile of sigma): near 0 where the views agree, so that sparsity spares the pixel."""
+    values = deviation.flatten().float()
+    rank = max(1, round(0.7 * values.numel()))
+    reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
+    return torch.ones_like(deviation) if reference <= 0 else (deviation / reference).clamp_max(1.0)
+

@@ -1,0 +1,89 @@
+"""Resampling of premultiplied layers [H, W, C], pixel-aligned with the way training images are reduced.
+
+Straight colours must not be averaged: a transparent pixel's colour means nothing and would bleed into its neighbours.
+What is averaged here is always the pair (transmittance, added light), in which compositing is linear.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+
+def box_reduce(layer: Tensor, factor: int) -> Tensor:
+    """Average blocks of factor x factor pixels; rows and columns that fill no block are dropped.
+
+    The same filter as `splatfacto.resize_image`, which reduces the photos: [H, W, C] to [H // factor, W // factor, C].
+    """
+    if factor == 1:
+        return layer
+    height, width = layer.shape[0] // factor, layer.shape[1] // factor
+    blocks = layer[: height * factor, : width * factor].reshape(height, factor, width, factor, layer.shape[2])
+    return blocks.mean(dim=(1, 3))
+
+
+def enlarge(layer: Tensor, factor: int, height: int, width: int) -> Tensor:
+    """Enlarge bilinearly by a whole factor and crop to [height, width, C]; pixel (0, 0) keeps its corner."""
+    if factor > 1:
+        planes = F.interpolate(layer.permute(2, 0, 1)[None], scale_factor=float(factor), mode="bilinear")
+        layer = planes[0].permute(1, 2, 0)
+    return layer[:height, :width]
+
+
+def letterbox(layer: Tensor, height: int, width: int, fill: float) -> Tensor:
+    """Fit a layer into a frame of any size and aspect: scaled without stretching, centred, `fill` around it.
+
+    Args:
+        layer: [H, W, C].
+        fill: value of the bars: 1 for a transmittance, 0 for added light.
+
+    Returns:
+        [height, width, C].
+    """
+    if layer.shape[:2] == (height, width):
+        return layer
+    scale = min(height / layer.shape[0], width / layer.shape[1])
+    inner = max(1, min(height, round(layer.shape[0] * scale))), max(1, min(width, round(layer.shape[1] * scale)))
+    planes = F.interpolate(layer.permute(2, 0, 1)[None], size=inner, mode="bilinear", antialias=scale < 1)
+    framed = layer.new_full((height, width, layer.shape[2]), fill)
+    top, left = (height - inner[0]) // 2, (width - inner[1]) // 2
+    framed[top : top + inner[0], left : left + inner[1]] = planes[0].permute(1, 2, 0)
+    return framed
+
+
+def reduced_size(height: int, width: int, factor: int) -> tuple[int, int]:
+    """Size of an overlay that holds one pixel for each started block of factor x factor pixels of its frame."""
+    return -(-height // factor), -(-width // factor)
+
+
+def to_training_scale(layer: Tensor, resolution: int, reduction: int, height: int, width: int) -> Tensor:
+    """Bring an overlay of 1 / `resolution` of the frame to a training image of 1 / `reduction` of the frame.
+
+    Args:
+        layer: [ceil(H / resolution), ceil(W / resolution), C] of a frame [H, W].
+        resolution, reduction: powers of two.
+        height, width: the frame.
+
+    Returns:
+        [H // reduction, W // reduction, C].
+    """
+    target = height // reduction, width // reduction
+    if reduction >= resolution:
+        return box_reduce(layer, reduction // resolution)[: target[0], : target[1]]
+    return enlarge(layer, resolution // reduction, *target)
+
+
+def stack_premultiplied(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Straight colour [..., 3] and matte [..., 1] as (transmittance [..., 1], added light [..., 3])."""
+    return 1.0 - alpha, alpha * color
+
+
+def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Tensor]:
+    """Undo `stack_premultiplied`: (colour [..., 3], matte [..., 1]); black where the matte is zero.
+
+    The transmittance may have one channel or three; the matte is one minus its mean.
+    """
+    alpha = 1.0 - transmittance.mean(dim=-1, keepdim=True)
+    color = torch.where(alpha > 0, addition / alpha.clamp_min(1e-6), torch.zeros_like(addition))
+    return color.clamp(0.0, 1.0), alpha

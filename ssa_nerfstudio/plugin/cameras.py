@@ -1,0 +1,54 @@
+"""nerfstudio's cameras as what a rasterizer takes: view matrices, intrinsics, frame sizes."""
+
+from __future__ import annotations
+
+from nerfstudio.cameras.cameras import Cameras
+from torch import Tensor
+
+
+def frame(camera: Cameras) -> tuple[int, int]:
+    """Width and height of one camera; from the host where `prepare` left them, since reading the device waits for it."""
+    known = (camera.metadata or {}).get("frame")
+    return known if known is not None else (int(camera.width.item()), int(camera.height.item()))
+
+
+def intrinsics(camera: Cameras, reduction: int) -> Tensor:
+    """Ks [1, 3, 3] in pixels of an image reduced by a whole factor."""
+    prepared = (camera.metadata or {}).get("Ks")
+    if prepared is not None:
+        return prepared[reduction]
+    Ks = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(camera.device)
+    Ks[:, :2] /= reduction
+    return Ks
+
+
+def view_matrix(camera_to_world: Tensor) -> Tensor:
+    """World to camera [C, 4, 4] with OpenCV axes, of rigid camera to world [C, 3 or 4, 4] with OpenGL axes."""
+    rotation = (camera_to_world[:, :3, :3] * camera_to_world.new_tensor([1.0, -1.0, -1.0])).transpose(1, 2)
+    view = camera_to_world.new_zeros(len(camera_to_world), 4, 4)
+    view[:, :3, :3] = rotation
+    view[:, :3, 3:] = -rotation @ camera_to_world[:, :3, 3:4]
+    view[:, 3, 3] = 1.0
+    return view
+
+
+def prepare(cameras: Cameras, reductions: tuple[int, ...]) -> list[Cameras]:
+    """Cut cameras into single ones that carry in their metadata what a training step asks for, ready on the device.
+
+    Metadata: `cam_idx`, `frame` (width, height on the host), `viewmat` [1, 4, 4], `Ks` {reduction: [1, 3, 3]}.
+    """
+    widths, heights = cameras.width.flatten().tolist(), cameras.height.flatten().tolist()
+    views = view_matrix(cameras.camera_to_worlds)
+    prepared = []
+    for index in range(len(widths)):
+        camera = cameras[index : index + 1]
+        Ks = {reduction: intrinsics(camera, reduction) for reduction in reductions}
+        camera.metadata = {
+            **(camera.metadata or {}),
+            "cam_idx": index,
+            "frame": (widths[index], heights[index]),
+            "viewmat": views[index : index + 1],
+            "Ks": Ks,
+        }
+        prepared.append(camera)
+    return prepared

@@ -1,0 +1,84 @@
+"""Photos, decoded and undistorted once and kept; cameras prepared once, so that a training step only picks one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.datasets.base_dataset import InputDataset
+
+from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.plugin.cameras import prepare
+
+TRAINING_REDUCTIONS = (1, 2, 4, 8)
+"""Factors by which splatfacto's resolution schedule reduces photos, for which intrinsics are kept ready."""
+
+
+class UnreadablePhoto(ValueError):
+    """A file that should be a photo and is none."""
+
+
+class NamedInputDataset(InputDataset):
+    """nerfstudio's dataset, whose errors say which file they mean."""
+
+    def get_numpy_image(self, image_idx: int) -> np.ndarray:
+        """Decode one photo: uint8 [H, W, 3 or 4].
+
+        Raises:
+            UnreadablePhoto: with the file's name, where it cannot be decoded.
+        """
+        path = self.image_filenames[image_idx]
+        try:
+            return super().get_numpy_image(image_idx)
+        except FileNotFoundError as error:
+            raise UnreadablePhoto(f"{path} does not exist; put the photo there or remove its frame") from error
+        except (OSError, SyntaxError, ValueError, AssertionError) as error:
+            raise UnreadablePhoto(
+                f"{path} cannot be read as a photo ({error}); copy it again from its source or remove its frame"
+            ) from error
+
+
+@dataclass
+class SSADatamanagerConfig(FullImageDatamanagerConfig):
+    """Configuration of `SSADatamanager`."""
+
+    _target: type = field(default_factory=lambda: SSADatamanager)
+    cache_images_type: Literal["uint8", "float32"] = "uint8"
+    """Type of the cached photos; uint8 is exact for 8-bit photos and a quarter of the memory."""
+
+
+class SSADatamanager(FullImageDatamanager[NamedInputDataset]):
+    """`FullImageDatamanager` that also works without CUDA, names unreadable files, and prepares its cameras once."""
+
+    config: SSADatamanagerConfig
+    _train_views: list[Cameras] | None = None
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]):
+        if not torch.cuda.is_available():
+            # Upstream pins memory for "cpu", which needs CUDA; "gpu" means the training device, here the CPU.
+            cache_images_device = "gpu"
+        try:
+            return super()._load_images(split, cache_images_device)
+        except UnreadablePhoto as error:
+            raise refuse(str(error)) from error
+        except AssertionError as error:
+            raise refuse(f"{error}; write w and h in transforms.json as the photos are") from error
+
+    def next_train(self, step: int) -> tuple[Cameras, dict]:
+        """Camera and photo of one training view; every view once before any comes again.
+
+        The camera's metadata hold what `cameras.prepare` put there.
+        """
+        photos = self.cached_train
+        if self._train_views is None:
+            self._train_views = prepare(self.train_cameras.to(self.device), TRAINING_REDUCTIONS)
+        index = self.train_unseen_cameras.pop(0)
+        if not self.train_unseen_cameras:
+            self.train_unseen_cameras = self.sample_train_cameras()
+        data = photos[index].copy()
+        data["image"] = data["image"].to(self.device, non_blocking=True)
+        return self._train_views[index], data

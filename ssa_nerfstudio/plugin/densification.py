@@ -1,0 +1,86 @@
+"""How the Gaussians multiply: adaptive density control (ADC) and MCMC, gsplat's strategies behind the same four calls.
+
+Both answer `initialize_state(scene_scale)`, `step_pre_backward(...)`, `step_post_backward(...)` and have `absgrad`, with
+the arguments that `SplatfactoModel` passes, so that the model does not know which one it holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
+from torch import Tensor
+
+
+@dataclass
+class AdaptiveDensityControl(DefaultStrategy):
+    """gsplat's DefaultStrategy (3DGS, Kerbl et al. 2023), with statistics that need no host synchronisation.
+
+    gsplat 1.4.0 resets opacities at step 0 too (`step % reset_every == 0`). Here that reset is left out: it exists to
+    expose floaters, of which there are none before the first step, and the original implementation has none either.
+    """
+
+    def step_post_backward(
+        self,
+        params: Any,
+        optimizers: dict[str, torch.optim.Optimizer],
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
+    ) -> None:
+        """Collect gradients; grow, prune and reset where the schedule says so."""
+        if step == 0:
+            self._update_state(params, state, info, packed)
+            return
+        super().step_post_backward(params, optimizers, state, step, info, packed)
+
+    def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
+        """The same sums as gsplat's, over all Gaussians with zeros where invisible, instead of over a compacted list.
+
+        Compaction (`torch.where`) waits for the device at every training step.
+        """
+        means2d: Tensor = info[self.key_for_gradient]
+        gradients = means2d.absgrad if self.absgrad else means2d.grad  # pyright: ignore[reportAttributeAccessIssue]
+        assert gradients is not None
+        if state["grad2d"] is None:
+            state["grad2d"] = gradients.new_zeros(gradients.shape[1])
+            state["count"] = gradients.new_zeros(gradients.shape[1])
+        if self.refine_scale2d_stop_iter > 0 and state["radii"] is None:
+            state["radii"] = gradients.new_zeros(gradients.shape[1])
+        # Gradients with respect to coordinates that run over [-1, 1] across the image.
+        half = 0.5 * info["n_cameras"]
+        norms = torch.hypot(gradients[..., 0] * (half * info["width"]), gradients[..., 1] * (half * info["height"]))
+        visible = info["radii"] > 0  # [C, N]
+        state["grad2d"] += torch.where(visible, norms, torch.zeros_like(norms)).sum(dim=0)
+        state["count"] += visible.sum(dim=0)
+        if self.refine_scale2d_stop_iter > 0:
+            radii = info["radii"].amax(dim=0) / float(max(info["width"], info["height"]))
+            torch.maximum(state["radii"], radii, out=state["radii"])
+
+
+@dataclass
+class MarkovChainMonteCarlo(MCMCStrategy):
+    """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians move to living ones, up to a fixed number."""
+
+    absgrad: bool = False
+    """MCMC reads no gradients of the centres; a field because the render call asks for it."""
+
+    def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
+        """State of the strategy; the scene's scale plays no part in it."""
+        return super().initialize_state()
+
+    def step_post_backward(
+        self,
+        params: Any,
+        optimizers: dict[str, torch.optim.Optimizer],
+        state: dict[str, Any],
+        step: int,
+        info: dict[str, Any],
+        packed: bool = False,
+    ) -> None:
+        """Relocate, add and perturb; the noise follows the current learning rate of the means."""
+        lr = optimizers["means"].param_groups[0]["lr"]
+        super().step_post_backward(params, optimizers, state, step, info, lr=lr)

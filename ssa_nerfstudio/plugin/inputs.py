@@ -1,0 +1,76 @@
+"""Checks of what the user hands over, before anything is built: each failure is one line and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+
+from ssa_nerfstudio.errors import refuse
+
+MIN_VIEWS = 2
+"""An artifact is what does not change from view to view: one view cannot show it."""
+
+
+def check_device(device: torch.device | str) -> None:
+    """Refuse CUDA where there is none."""
+    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+        raise refuse(
+            "CUDA was asked for and this machine has none that torch can use; add --machine.device-type cpu, "
+            "or install a torch build for your driver"
+        )
+
+
+def check_transforms(data: Path) -> None:
+    """Refuse a nerfstudio dataset whose transforms.json is missing, unreadable, empty, or holds broken poses.
+
+    Has to run before the dataparser does: it averages the poses, after which one bad frame has spoilt all of them.
+
+    Args:
+        data: the dataset's folder, or its .json file.
+    """
+    path = data if data.suffix == ".json" else data / "transforms.json"
+    if not data.exists():
+        raise refuse(f"{data} does not exist; give --data a folder that holds transforms.json and the photos")
+    if not path.exists():
+        raise refuse(f"{path} does not exist; make it from photos with `ns-process-data images --data PHOTOS`")
+    try:
+        frames = json.loads(path.read_text())["frames"]
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise refuse(f"{path} is no valid JSON ({error}); write it again with ns-process-data") from error
+    except (KeyError, TypeError) as error:
+        raise refuse(f"{path} has no list 'frames'; write it again with ns-process-data") from error
+    if len(frames) < MIN_VIEWS:
+        raise refuse(f"{path} lists {len(frames)} photos; at least {MIN_VIEWS} are needed, 30 and more work well")
+    for frame in frames:
+        name = frame.get("file_path", "a frame without file_path")
+        matrix = np.array(frame.get("transform_matrix", []), dtype=object)
+        try:
+            finite = matrix.shape in ((4, 4), (3, 4)) and all(math.isfinite(float(v)) for v in matrix.flat)
+        except (TypeError, ValueError):
+            finite = False
+        if not finite:
+            raise refuse(
+                f"{path}: the pose of {name} is no 4 x 4 matrix of finite numbers; remove that frame or register it again"
+            )
+        photo = path.parent / str(name)
+        if not photo.exists() and not list(path.parent.glob(f"{photo.parent.name}_*/{photo.name}")):
+            raise refuse(f"{path} names {name}, which does not exist; put the photo there or remove the frame")
+
+
+def check_views(outputs: DataparserOutputs, source: Path) -> None:
+    """Refuse training splits of fewer than two views and poses that are not finite."""
+    views = len(outputs.image_filenames)
+    if views < MIN_VIEWS:
+        raise refuse(
+            f"{source} leaves {views} photos to train on; at least {MIN_VIEWS} are needed: "
+            "add photos, or hold fewer back for evaluation"
+        )
+    finite = torch.isfinite(outputs.cameras.camera_to_worlds).flatten(1).all(dim=1)
+    if not finite.all():
+        name = outputs.image_filenames[int((~finite).nonzero()[0])]
+        raise refuse(f"the pose of {name} is not finite; remove that photo from {source} or register it again")

@@ -1,0 +1,95 @@
+"""The methods that `ns-train` lists: entry points, nothing else."""
+
+from __future__ import annotations
+
+from nerfstudio.configs.base_config import ViewerConfig
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
+from nerfstudio.plugins.types import MethodSpecification
+
+from ssa_nerfstudio.plugin import upstream
+from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
+from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.pipeline import SSAPipelineConfig
+from ssa_nerfstudio.plugin.trainer import FusedAdamConfig, SSATrainerConfig, machine
+
+# Every nerfstudio command imports this module through the entry points, before it loads or renders anything.
+upstream.preload_libusb()
+upstream.allow_checkpoint_scalars()
+upstream.give_mcmc_a_cpu_body()
+
+
+def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:
+    """splatfacto's trainer settings with fused optimisers, an `overlay` group, and less evaluation while training."""
+    return SSATrainerConfig(
+        method_name=name,
+        max_num_iterations=30_000,
+        steps_per_save=2_000,
+        steps_per_eval_batch=0,
+        steps_per_eval_image=5_000,
+        steps_per_eval_all_images=0,
+        mixed_precision=False,
+        machine=machine(),
+        pipeline=SSAPipelineConfig(
+            datamanager=SSADatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True)),
+            model=model,
+        ),
+        optimizers={
+            "means": {
+                "optimizer": FusedAdamConfig(lr=1.6e-4),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1.6e-6, max_steps=30_000),
+            },
+            "features_dc": {"optimizer": FusedAdamConfig(lr=2.5e-3), "scheduler": None},
+            "features_rest": {"optimizer": FusedAdamConfig(lr=2.5e-3 / 20), "scheduler": None},
+            "opacities": {"optimizer": FusedAdamConfig(lr=0.05), "scheduler": None},
+            "scales": {"optimizer": FusedAdamConfig(lr=0.005), "scheduler": None},
+            "quats": {"optimizer": FusedAdamConfig(lr=0.001), "scheduler": None},
+            "overlay": {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None},
+            "camera_opt": {
+                "optimizer": FusedAdamConfig(lr=1e-4),
+                "scheduler": ExponentialDecaySchedulerConfig(
+                    lr_final=5e-7, max_steps=30_000, warmup_steps=1_000, lr_pre_warmup=0
+                ),
+            },
+            "bilateral_grid": {
+                "optimizer": FusedAdamConfig(lr=2e-3),
+                "scheduler": ExponentialDecaySchedulerConfig(
+                    lr_final=1e-4, max_steps=30_000, warmup_steps=1_000, lr_pre_warmup=0
+                ),
+            },
+        },
+        viewer=ViewerConfig(num_rays_per_chunk=1 << 15),
+        vis="viewer",
+    )
+
+
+ssa_splatfacto = MethodSpecification(
+    config=_trainer("ssa-splatfacto", SSASplatfactoModelConfig()),
+    description="splatfacto that removes what every photo has in front of the scene (watermark, dashboard, mud, rain).",
+)
+
+ssa_splatfacto_mcmc = MethodSpecification(
+    config=_trainer("ssa-splatfacto-mcmc", SSASplatfactoModelConfig(strategy="mcmc")),
+    description="ssa-splatfacto with MCMC densification: a fixed number of Gaussians (cap_max).",
+)
+
+ssa_splatfacto_paper = MethodSpecification(
+    config=_trainer(
+        "ssa-splatfacto-paper",
+        SSASplatfactoModelConfig(
+            sparsity="l1",
+            sparsity_weight=0.05,
+            background_color="black",
+            num_downscales=0,
+            use_absgrad=False,
+            densify_grad_thresh=2e-4,
+            cull_alpha_thresh=0.005,
+            densify_size_thresh=0.01,
+            cull_scale_thresh=0.1,
+            stop_screen_size_at=0,
+            scale_by_extent=True,
+            pause_after_reset=0,
+        ),
+    ),
+    description="The protocol of the SSA-3DGS paper: 3DGS's own settings and the l1 sparsity of 0.05.",
+)

@@ -1,0 +1,331 @@
+"""splatfacto with an artifact in front: the wiring of overlay, rasterizer, densification and losses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.model_components.lib_bilagrid import total_variation_loss
+from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig
+from torch import Tensor, nn
+from torch.nn import Parameter
+
+from ssa_nerfstudio import metrics
+from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, composite, fitted
+from ssa_nerfstudio.overlay.losses import Sparsity, photometric, sparsity
+from ssa_nerfstudio.overlay.resampling import straight_color
+from ssa_nerfstudio.plugin.camera_groups import match_camera, nearest_aspect
+from ssa_nerfstudio.plugin.cameras import frame, intrinsics, view_matrix
+from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.upstream import without_lpips
+from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
+
+
+@dataclass
+class SSASplatfactoModelConfig(SplatfactoModelConfig):
+    """Configuration of `SSASplatfactoModel`: splatfacto's, and the artifact's."""
+
+    _target: type = field(default_factory=lambda: SSASplatfactoModel)
+    overlay: Literal["on", "off", "given"] = "on"
+    """on: learn the artifact; off: plain splatfacto; given: take the true artifact from overlay_given."""
+    overlay_given: Path | None = None
+    """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
+    (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
+    overlay_start: Literal["statistics", "constant"] = "statistics"
+    """statistics: W = mean over the photos, A = exp(-sigma / 0.05) (paper); constant: W = 0.5, A = 0.1 (its ablation)."""
+    overlay_downscale: Literal[1, 2, 4] = 1
+    """The overlay has one pixel for a block of this many pixels a side: 1, 1/2 or 1/4 of the photos' resolution."""
+    sparsity: Sparsity = "log"
+    """What keeps the overlay empty: log (concave, weighted by evidence), l1 (the paper's), off."""
+    sparsity_weight: float = 0.05
+    """Weight of the sparsity term, the paper's lambda_sparse; not negative."""
+    strategy: Literal["adc", "mcmc"] = "adc"
+    """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
+    cap_max: int = 1_000_000
+    """MCMC: the largest number of Gaussians."""
+    mcmc_stop_at: int = 25_000
+    """MCMC: step after which Gaussians are no longer added or relocated."""
+    mcmc_opacity_start: float = 0.5
+    """MCMC: opacity of the first Gaussians, in (0, 1)."""
+    mcmc_scale_start: float = 0.1
+    """MCMC: size of the first Gaussians relative to the distance of their neighbours."""
+    mcmc_opacity_regularizer: float = 0.01
+    """MCMC: weight of the mean opacity in the loss, which frees Gaussians for relocation."""
+    mcmc_scale_regularizer: float = 0.01
+    """MCMC: weight of the mean scale (world units) in the loss."""
+    scale_by_extent: bool = False
+    """ADC: measure split and prune sizes, and the means' learning rate, in units of the cameras' extent (3DGS, the
+    paper) instead of the normalised scene (splatfacto)."""
+    pause_after_reset: int | None = None
+    """ADC: steps without refinement after an opacity reset; None: one for each photo and a refinement's (splatfacto)."""
+    rasterizer: RasterizerName = "auto"
+    """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""
+
+
+class SSASplatfactoModel(SplatfactoModel):
+    """Gaussian splats and, per camera group, the artifact in front of them. `rgb` is the clean render everywhere.
+
+    The overlays come from the pipeline (`set_overlays`), or from a checkpoint, whose shapes they take.
+    """
+
+    config: SSASplatfactoModelConfig
+
+    def populate_modules(self) -> None:
+        """Build splatfacto's Gaussians without CUDA and without downloads, then what is ours."""
+        points = self.seed_points
+        if points is not None:
+            # Upstream moves seed colours to CUDA (splatfacto.py:261); given none, it starts from random ones.
+            self.seed_points = (points[0], points[1][:0])
+        with without_lpips():
+            super().populate_modules()
+        del self.lpips
+        self.seed_points = points
+        if points is not None and not self.config.random_init and len(points[1]):
+            colors = points[1].float() / 255.0
+            dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-10)
+            self.gauss_params["features_dc"] = Parameter(dc)
+        self.overlays = nn.ModuleList()
+        self.register_buffer("camera_keys", torch.zeros(0, 6, dtype=torch.float64))
+        self._keys: list[list[float]] = []
+        self._group_of_view: list[int] = []
+        self.scene_scale = 1.0
+        self._make_strategy()
+
+    def _make_strategy(self) -> None:
+        config = self.config
+        if config.strategy == "mcmc":
+            self.strategy = MarkovChainMonteCarlo(
+                cap_max=config.cap_max,
+                refine_start_iter=config.warmup_length,
+                refine_stop_iter=config.mcmc_stop_at,
+                refine_every=config.refine_every,
+            )
+            with torch.no_grad():
+                self.opacities.fill_(torch.tensor(config.mcmc_opacity_start).logit())
+                self.scales.add_(torch.tensor(config.mcmc_scale_start).log())
+        else:
+            self.strategy = AdaptiveDensityControl(**{**vars(self.strategy), "verbose": False})
+            if config.pause_after_reset is not None:
+                self.strategy.pause_refine_after_reset = config.pause_after_reset
+        self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
+
+    def set_scene_extent(self, extent: float) -> None:
+        """Tell the radius of the cameras' positions (world units), for `scale_by_extent`."""
+        if self.config.scale_by_extent:
+            self.scene_scale = extent
+            self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
+
+    def set_overlays(
+        self, overlays: list[ScreenSpaceOverlay] | list[GivenOverlay], keys: Tensor, group_of_view: list[int]
+    ) -> None:
+        """Put artifacts in front of the scene.
+
+        Args:
+            overlays: one a camera group.
+            keys: [G, 6], what the groups' cameras are (`camera_groups.group_cameras`).
+            group_of_view: each training view's group.
+        """
+        self.overlays = nn.ModuleList(overlays).to(self.device)
+        self.camera_keys = keys.to(self.device)
+        self._keys = keys.tolist()
+        self._group_of_view = group_of_view
+
+    def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
+        """Load a checkpoint of any number of Gaussians, and its overlays.
+
+        Parameter objects stay what they are: the optimisers that hold them were built before (splatfacto replaces them,
+        splatfacto.py:392, and a resumed run then trains nothing).
+        """
+        self.step = 30000
+        n = dict["gauss_params.means"].shape[0]
+        for parameter in self.gauss_params.values():
+            parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
+        self._prepare_overlays(dict)
+        result = super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+        self._keys = self.camera_keys.tolist()
+        return result
+
+    def _prepare_overlays(self, state: dict[str, Any]) -> None:
+        """Make room for a checkpoint's overlays, or refuse one that does not fit those that are being trained."""
+        frames = [
+            tuple(int(v) for v in state[f"overlays.{g}.frame"]) for g in range(len(state.get("camera_keys", ())))
+        ]
+        if len(self.overlays):
+            here = [tuple(o.frame.tolist()) for o in self.overlays]
+            if frames != here:
+                raise refuse(
+                    f"the checkpoint's overlays are (height, width, downscale) {frames or 'absent'}, this run's are {here}; "
+                    "resume with the photos, camera-res-scale-factor and overlay options that it was trained with"
+                )
+            return
+        if not frames:
+            return
+        if self.training and self.config.overlay == "off":
+            raise refuse("the checkpoint has an overlay and this run has none; resume with --pipeline.model.overlay on")
+        given = "overlays.0.transmittance" in state
+        self.overlays = nn.ModuleList(
+            GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3)) if given else ScreenSpaceOverlay(h, w, resolution)
+            for h, w, resolution in frames
+        ).to(self.device)
+        self.camera_keys = torch.zeros(len(frames), 6, dtype=torch.float64, device=self.device)
+
+    def get_param_groups(self) -> dict[str, list[Parameter]]:
+        """splatfacto's groups, and `overlay` where one is learned."""
+        groups = super().get_param_groups()
+        learned = list(self.overlays.parameters())
+        if learned:
+            groups["overlay"] = learned
+        return groups
+
+    def get_outputs(self, camera: Cameras) -> dict[str, Tensor | None]:
+        """Render one camera.
+
+        Returns:
+            rgb [H, W, 3]: the clean scene; accumulation [H, W, 1]; depth [H, W, 1] (not while training);
+            background [3], outside training [H, W, 3]; and, where there is an artifact: composite [H, W, 3],
+            the picture that a photo shows, overlay_rgb [H, W, 3] and overlay_alpha [H, W, 1].
+        """
+        reduction = self._get_downscale_factor()
+        width, height = frame(camera)
+        drawn = self._render(camera, width // reduction, height // reduction, reduction)
+        if not len(self.overlays):
+            return drawn
+        transmittance, addition = self._layers_for(camera, width, height, reduction)
+        drawn["composite"] = composite(drawn["rgb"], transmittance, addition)
+        if not self.training:
+            drawn["composite"] = drawn["composite"].clamp(0.0, 1.0)
+            drawn["overlay_rgb"], drawn["overlay_alpha"] = straight_color(transmittance, addition)
+        elif self.config.overlay == "given":
+            drawn["composite"] = drawn["composite"].clamp(0.0, 1.0)
+        return drawn
+
+    def _render(self, camera: Cameras, width: int, height: int, reduction: int) -> dict[str, Any]:
+        """The clean scene at 1 / reduction of the camera's frame."""
+        gaussians = dict(self.gauss_params)
+        if self.crop_box is not None and not self.training:
+            inside = self.crop_box.within(self.means).squeeze()
+            if not inside.any():
+                return self.get_empty_outputs(width, height, self.background_color)
+            gaussians = {name: values[inside] for name, values in gaussians.items()}
+        colors, sh_degree = gaussians["features_dc"], None
+        if self.config.sh_degree > 0:
+            sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
+            colors = torch.cat([colors[:, None], gaussians["features_rest"]], dim=1)
+        else:
+            colors = torch.sigmoid(colors)
+        with_depth = self.config.output_depth_during_training or not self.training
+        render, alpha, self.info = rasterizer(self.config.rasterizer, self.device)(
+            means=gaussians["means"],
+            quats=gaussians["quats"],
+            scales=torch.exp(gaussians["scales"]),
+            opacities=torch.sigmoid(gaussians["opacities"]).squeeze(-1),
+            colors=colors,
+            viewmats=self._view_matrix(camera),
+            Ks=intrinsics(camera, reduction),
+            width=width,
+            height=height,
+            packed=False,
+            sh_degree=sh_degree,
+            render_mode="RGB+ED" if with_depth else "RGB",
+            absgrad=self.strategy.absgrad,
+            rasterize_mode=self.config.rasterize_mode,
+        )
+        if self.training:
+            self.strategy.step_pre_backward(
+                self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
+            )
+        background = self._get_background_color()
+        rgb = torch.clamp(render[0, ..., :3] + (1.0 - alpha[0]) * background, 0.0, 1.0)
+        if self.config.use_bilateral_grid and self.training:
+            rgb = self._apply_bilateral_grid(rgb[None], camera.metadata["cam_idx"], height, width)[0]
+        depth = None
+        if with_depth:
+            depth = torch.where(alpha[0] > 0, render[0, ..., 3:], render[..., 3].detach().max())
+        return {
+            "rgb": rgb,
+            "depth": depth,
+            "accumulation": alpha[0],
+            "background": background if self.training else background.expand(height, width, 3),
+        }
+
+    def _view_matrix(self, camera: Cameras) -> Tensor:
+        """World to camera [1, 4, 4], with the camera optimiser's correction while training."""
+        if not self.training:
+            return view_matrix(camera.camera_to_worlds)
+        if self.camera_optimizer.config.mode == "off" and "viewmat" in camera.metadata:
+            return camera.metadata["viewmat"]
+        return view_matrix(self.camera_optimizer.apply_to_camera(camera))
+
+    def _layers_for(self, camera: Cameras, width: int, height: int, reduction: int) -> tuple[Tensor, Tensor]:
+        """Transmittance and added light of the camera's group, in its frame at 1 / reduction."""
+        if self.training:
+            return self.overlays[self._group_of_view[camera.metadata["cam_idx"]]].layers(reduction)
+        group = match_camera(camera, self._keys)
+        if group is None:
+            group = nearest_aspect(camera, self._keys)
+        return fitted(self.overlays[group], height, width)  # pyright: ignore[reportArgumentType]
+
+    def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
+        """The paper's loss: photometric on what the photo shows, sparsity of the matte, and the strategy's own terms."""
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
+        if "mask" in batch:
+            mask = self._downscale_if_required(batch["mask"].float()).to(self.device)
+            target, shown = target * mask, shown * mask
+        losses = {"main_loss": photometric(shown, target, self.config.ssim_lambda)}
+        if not self.training:
+            return losses
+        if self.config.overlay == "on" and len(self.overlays) and self.config.sparsity != "off":
+            terms = [sparsity(o.matte(), o.evidence, self.config.sparsity) for o in self.overlays]
+            losses["sparsity"] = self.config.sparsity_weight * torch.stack(terms).mean()
+        if self.config.strategy == "mcmc":
+            losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()
+            losses["mcmc_scale_reg"] = self.config.mcmc_scale_regularizer * torch.exp(self.scales).mean()
+        if self.config.use_scale_regularization and self.step % 10 == 0:
+            spread = self.scales.amax(dim=-1) - self.scales.amin(dim=-1)
+            excess = torch.exp(spread).clamp_min(self.config.max_gauss_ratio) - self.config.max_gauss_ratio
+            losses["scale_reg"] = 0.1 * excess.mean()
+        self.camera_optimizer.get_loss_dict(losses)
+        if self.config.use_bilateral_grid:
+            losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+        return losses
+
+    def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
+        """While training: PSNR of the composite against the photo, the number of Gaussians, the mean matte."""
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        shown = outputs.get("composite")
+        values: dict[str, Any] = {"gaussian_count": self.num_points}
+        with torch.no_grad():
+            values["psnr"] = metrics.psnr(outputs["rgb"], target)
+            if shown is not None:
+                values["composite_psnr"] = metrics.psnr(shown, target)
+        self.camera_optimizer.get_metrics_dict(values)
+        return values
+
+    def get_image_metrics_and_images(
+        self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
+    ) -> tuple[dict[str, float], dict[str, Tensor]]:
+        """Compare one test view with the clean render: psnr (dB), ssim ("valid" padding), flip, mean colour deviation.
+
+        `composite_psnr` compares what the photo shows with the photo: the figure to read where test photos carry the
+        artifact too.
+        """
+        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        render = outputs["rgb"]
+        values = {
+            "psnr": float(metrics.psnr(render, target)),
+            "ssim": float(metrics.ssim(render, target)),
+            "flip": float(metrics.flip(render, target)),
+            "mean_colour_deviation": float(metrics.mean_colour_deviation(render, target)),
+        }
+        pictures = {"img": torch.cat([target, render], dim=1)}
+        if "composite" in outputs:
+            values["composite_psnr"] = float(metrics.psnr(outputs["composite"], target))
+            pictures["overlay"] = torch.cat(
+                [outputs["overlay_rgb"] * outputs["overlay_alpha"], outputs["overlay_alpha"].expand_as(target)], dim=1
+            )
+        return values, pictures

@@ -1,0 +1,43 @@
+"""Schedules of 30000 steps made to fit a run of another length."""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
+FULL_LENGTH = 30_000
+"""Steps that every schedule of splatfacto and 3DGS assumes."""
+SHORTEST_REFINEMENT = 10
+"""Refinement is never more frequent than this many steps: its statistics need a few views to mean something."""
+
+_MODEL_STEPS = (
+    "warmup_length",
+    "resolution_schedule",
+    "sh_degree_interval",
+    "stop_screen_size_at",
+    "stop_split_at",
+    "mcmc_stop_at",
+)
+
+
+def scaled(config: TrainerConfig) -> TrainerConfig:
+    """A copy of a run's configuration with every schedule scaled by its number of steps / 30000.
+
+    Scaled are: learning-rate decay and warm-up, the resolution schedule, spherical harmonics, the refinement's start,
+    stop and interval, and with the interval the opacity resets, which are counted in refinements.
+    """
+    config = copy.deepcopy(config)
+    factor = config.max_num_iterations / FULL_LENGTH
+    model = config.pipeline.model
+    for name in _MODEL_STEPS:
+        setattr(model, name, max(1, round(getattr(model, name) * factor)))
+    model.refine_every = max(SHORTEST_REFINEMENT, round(model.refine_every * factor))
+    for entry in config.optimizers.values():
+        scheduler = entry["scheduler"]
+        if scheduler is not None:
+            scheduler.max_steps = max(1, round(scheduler.max_steps * factor))
+            scheduler.warmup_steps = round(scheduler.warmup_steps * factor)
+    return config
