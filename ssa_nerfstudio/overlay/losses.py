@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 from functools import lru_cache
 from typing import Literal
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 Sparsity = Literal["l1", "log", "off"]
@@ -22,29 +25,38 @@ SSIM_WINDOW = 11
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
     """(1 - w) mean |prediction - target| + w (1 - SSIM) (paper, equation of L_rgb; w = 0.2).
 
-    Images of less than 11 pixels a side have no window for SSIM and are compared by L1 alone.
+    Where a kernel exists (numba on the CPU, Triton on CUDA), value and gradient come from the same two passes over the
+    image; elsewhere from `ssim` and autograd. Images of less than 11 pixels a side have no window for SSIM and are
+    compared by L1 alone.
 
     Args:
-        prediction, target: [H, W, 3] in [0, 1].
+        prediction, target: [H, W, 3] in [0, 1]; only the prediction receives a gradient.
         ssim_weight: w in [0, 1]; at 0 SSIM is not computed.
     """
-    l1 = (prediction - target).abs().mean()
     if ssim_weight == 0 or min(prediction.shape[:2]) < SSIM_WINDOW:
-        return l1
+        return (prediction - target).abs().mean()
+    return _Photometric.apply(prediction, target, ssim_weight)  # pyright: ignore[reportReturnType]
+
+
+def photometric_reference(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+    """`photometric` in plain torch, differentiable in both images: the oracle of the kernels."""
+    l1 = (prediction - target).abs().mean()
     return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(prediction, target))
 
 
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean structural similarity over the positions where the whole 11 x 11 window fits ("valid" padding).
 
-    K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004). On CUDA the separable window is two sums of shifted images:
-    they compile, with everything around them, into a few kernels; convolutions would not.
+    K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004), as pytorch_msssim.
 
     Args:
         prediction, target: [H, W, 3] in [0, 1], at least 11 pixels a side.
     """
     x, y = prediction.permute(2, 0, 1), target.permute(2, 0, 1)
-    mean_x, mean_y, squares, product = _blur(torch.cat([x, y, x * x + y * y, x * y])).chunk(4)
+    moments = torch.cat([x, y, x * x + y * y, x * y])[None]
+    window = torch.tensor(gaussian_window(), dtype=x.dtype, device=x.device).expand(moments.shape[1], 1, 1, -1)
+    rows = F.conv2d(moments, window, groups=moments.shape[1])
+    mean_x, mean_y, squares, product = F.conv2d(rows, window.mT, groups=moments.shape[1])[0].chunk(4)
     mean_product = mean_x * mean_y
     mean_squares = mean_x * mean_x + mean_y * mean_y
     c1, c2 = 0.01**2, 0.03**2
@@ -75,28 +87,42 @@ def sparsity(matte: Tensor, evidence: Tensor, kind: Sparsity) -> Tensor:
     return (weight * torch.log1p(matte / LOG_SOFTNESS)).mean() / math.log1p(1.0 / LOG_SOFTNESS)
 
 
-def _blur(planes: Tensor) -> Tensor:
-    """Gaussian window over planes [C, H, W], "valid": [C, H - 10, W - 10]."""
-    if planes.device.type == "cpu":
-        # Products with the banded window matrix: without a compiler the fastest form at the sizes a CPU trains at.
-        rows, columns = (_window_matrix(size, planes.dtype) for size in planes.shape[1:])
-        return rows @ (planes @ columns.T)
-    for dim in (1, 2):
-        length = planes.shape[dim] - SSIM_WINDOW + 1
-        planes = sum(weight * planes.narrow(dim, shift, length) for shift, weight in enumerate(_window()))  # pyright: ignore
-    return planes
-
-
-@lru_cache(maxsize=1)
-def _window() -> tuple[float, ...]:
+def gaussian_window() -> tuple[float, ...]:
+    """SSIM's window along one dimension: 11 weights of a Gaussian with sigma 1.5, summing to 1."""
     values = [math.exp(-((i - SSIM_WINDOW // 2) ** 2) / (2 * 1.5**2)) for i in range(SSIM_WINDOW)]
     return tuple(v / sum(values) for v in values)
 
 
-@lru_cache(maxsize=32)
-def _window_matrix(size: int, dtype: torch.dtype) -> Tensor:
-    """The window at each of its positions along `size` pixels: [size - 10, size]."""
-    matrix = torch.zeros(size - SSIM_WINDOW + 1, size, dtype=dtype)
-    for shift, weight in enumerate(_window()):
-        matrix.diagonal(shift).fill_(weight)
-    return matrix
+class _Photometric(torch.autograd.Function):
+    """The loss as one operation whose gradient is computed together with its value."""
+
+    @staticmethod
+    def forward(ctx, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # pyright: ignore
+        x, y = prediction.detach(), target.detach().to(prediction.dtype)
+        if x.is_cuda and _triton_available():
+            from ssa_nerfstudio.overlay._photometric_triton import value_and_gradient
+
+            value, gradient = value_and_gradient(x, y, ssim_weight, gaussian_window())
+        elif x.device.type == "cpu":
+            from ssa_nerfstudio.overlay._photometric_numba import value_and_gradient
+
+            planes = (image.permute(2, 0, 1).contiguous().numpy() for image in (x, y))
+            number, planes = value_and_gradient(*planes, ssim_weight, np.array(gaussian_window(), x.numpy().dtype))
+            value, gradient = x.new_tensor(number), torch.from_numpy(planes).permute(1, 2, 0)
+        else:
+            with torch.enable_grad():
+                x = x.requires_grad_()
+                value = photometric_reference(x, y, ssim_weight)
+                (gradient,) = torch.autograd.grad(value, x)
+        ctx.save_for_backward(gradient)
+        return value.detach()
+
+    @staticmethod
+    def backward(ctx, v: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        (gradient,) = ctx.saved_tensors
+        return v * gradient, None, None
+
+
+@lru_cache(maxsize=1)
+def _triton_available() -> bool:
+    return importlib.util.find_spec("triton") is not None

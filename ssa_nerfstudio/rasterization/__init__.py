@@ -33,7 +33,7 @@ def rasterizer(name: RasterizerName, device: torch.device | str) -> Callable:
     if name == "gsplat":
         if kind != "cuda":
             raise ValueError(f"rasterizer 'gsplat' needs CUDA, the Gaussians are on {kind}; use 'cpu' or 'auto'")
-        from gsplat.rendering import rasterization
+        from ssa_nerfstudio.rasterization.cuda import rasterization
 
         return rasterization
     if name == "cpu":

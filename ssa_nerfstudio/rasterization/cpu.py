@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-
 import numpy as np
 import torch
 from torch import Tensor
@@ -14,8 +10,7 @@ from ssa_nerfstudio.rasterization import _kernels
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.interface import rasterization_with
 from ssa_nerfstudio.rasterization.projection import Splats
-
-_pool: ThreadPoolExecutor | None = None
+from ssa_nerfstudio.threads import on_all_threads
 
 
 def blend(
@@ -58,7 +53,7 @@ class _Blend(torch.autograd.Function):
         transmittance = np.ones((height, width), centres.dtype)
         last = np.zeros((height, width), np.int32)
         starts, members, _ = bands
-        _on_all_threads(_kernels.blend_bands, starts, members, centres, *arrays, bounds, image, transmittance, last)
+        on_all_threads(_kernels.blend_bands, starts, members, centres, *arrays, bounds, image, transmittance, last)
         ctx.save_for_backward(means2d, ids)
         ctx.blended = (bands, centres, arrays, bounds, transmittance, last)
         ctx.camera, ctx.absgrad = camera, absgrad
@@ -69,7 +64,7 @@ class _Blend(torch.autograd.Function):
         means2d, ids = ctx.saved_tensors
         (starts, members, slots), centres, arrays, bounds, transmittance, last = ctx.blended
         partial = np.zeros((len(members), _kernels.GRADIENTS), np.float64)
-        _on_all_threads(
+        on_all_threads(
             _kernels.backpropagate_bands,
             starts,
             members,
@@ -106,34 +101,3 @@ def _tile_bounds(centres: np.ndarray, radii: np.ndarray, width: int, height: int
     bounds[:, 0::2] = lower * TILE
     bounds[:, 1::2] = np.minimum(upper * TILE, size)
     return bounds
-
-
-def _on_all_threads(kernel: Callable, *arguments) -> None:
-    """Run `kernel(t, threads, *arguments)` for every thread t; the kernel releases the GIL.
-
-    A pool of Python threads rather than numba's `prange`: its threading layers allow no concurrent calls from the
-    viewer's and the trainer's threads everywhere, and OpenMP's spinning barriers stall when cores are shared.
-    """
-    threads = torch.get_num_threads()
-    if threads == 1:
-        kernel(0, 1, *arguments)
-        return
-    jobs = [_executor().submit(kernel, t, threads, *arguments) for t in range(1, threads)]
-    kernel(0, threads, *arguments)
-    for job in jobs:
-        job.result()
-
-
-def _executor() -> ThreadPoolExecutor:
-    global _pool
-    if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="ssa-blend")
-    return _pool
-
-
-def _forget_pool() -> None:
-    global _pool
-    _pool = None
-
-
-os.register_at_fork(after_in_child=_forget_pool)

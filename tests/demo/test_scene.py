@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 from pathlib import Path
 
+import libusb_package
 import numpy as np
-import open3d
 import pytest
 from PIL import Image
 
@@ -127,7 +128,7 @@ def test_what_a_dashboard_hides_is_seen_in_other_views() -> None:
     pixels = pixel_grid(scene, 8)
     pixels = pixels[pixels[:, 1] > 0.7 * scene.height]
     counts = []
-    for pose in test:
+    for pose in test[::2]:
         directions = scene.rays(pose, pixels)
         depth, _ = scene.trace(pose[:3, 3], directions)
         points = pose[:3, 3] + depth[:, None] * directions
@@ -177,14 +178,21 @@ def test_the_artifact_is_on_training_images_only(scene: DemoScene, artifact: Lay
             assert np.array_equal(written, artifact.apply(photo) if split == "train" else photo)
 
 
-def test_sparse_points_have_the_colours_of_the_photos(scene: DemoScene, dataset: Path) -> None:
-    cloud = open3d.io.read_point_cloud(str(dataset / "sparse_pc.ply"))
-    points, colours = np.asarray(cloud.points), np.asarray(cloud.colors)
-    expected_points, expected_colours = scene.sparse_points()
-    assert points.shape == (4000, 3)
-    assert points == pytest.approx(expected_points, abs=1e-5)
-    assert colours * 255 == pytest.approx(expected_colours, abs=0.01)
+def test_open3d_reads_the_sparse_points(scene: DemoScene, dataset: Path) -> None:
+    # open3d, nerfstudio's reader, links to libusb, which slim systems have only through this wheel.
+    ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
+    import open3d
 
+    cloud = open3d.io.read_point_cloud(dataset / "sparse_pc.ply")
+    points, colours = scene.sparse_points()
+    assert np.asarray(cloud.points) == pytest.approx(points, abs=1e-5)
+    assert np.asarray(cloud.colors) * 255 == pytest.approx(colours.astype(float), abs=0.01)
+
+
+def test_sparse_points_have_the_colours_of_the_photos(scene: DemoScene) -> None:
+    points, colours = scene.sparse_points()
+    assert points.shape == colours.shape == (4000, 3)
+    colours = colours / 255
     differences, shuffled = [], []
     for pose in scene.cameras[1]:
         position, depth = project(scene, pose, points)

@@ -1,0 +1,162 @@
+"""Do the rasterizers draw the same picture, and how fast? `python -m ssa_nerfstudio.benchmark.rasterizers`
+
+Compares image, alpha, expected depth and every gradient of each body on this machine with `reference` in float64, on
+Gaussians like those of a trained scene, and times forward + backward. On a CUDA machine gsplat's own `rasterization` is
+compared too. Errors are relative in the 2-norm: |a - b| / |b|.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import torch
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from ssa_nerfstudio.rasterization import cpu, rasterizer, reference
+from ssa_nerfstudio.rasterization.projection import project
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def random_scene(
+    n: int, width: int, height: int, size: float, dtype: torch.dtype = torch.float32, seed: int = 0
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """Gaussians in a 2 x 2 x 2 cube three units in front of a camera.
+
+    Args:
+        n: number of Gaussians.
+        size: their median standard deviation, in world units.
+
+    Returns:
+        Parameters as `rasterization` takes them (colours as third-degree spherical harmonics), viewmats, Ks.
+    """
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator)
+
+    means = torch.rand(n, 3, generator=generator) * 2 - 1
+    means[:, 2] += 3
+    gaussians = {
+        "means": means,
+        "quats": normal(n, 4),
+        "scales": size * torch.exp(0.4 * normal(n, 3)),
+        "opacities": torch.rand(n, generator=generator),
+        "colors": 0.3 * normal(n, 16, 3),
+    }
+    viewmats = torch.eye(4, dtype=dtype)[None]
+    Ks = torch.tensor([[1.1 * width, 0, width / 2], [0, 1.1 * width, height / 2], [0, 0, 1]], dtype=dtype)[None]
+    return {name: value.to(dtype) for name, value in gaussians.items()}, viewmats, Ks
+
+
+def draw(
+    rasterization: Callable,
+    gaussians: dict[str, Tensor],
+    viewmats: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    **options,
+) -> dict[str, Tensor]:
+    """Render RGB and expected depth, and pull fixed random cotangents back: everything a body computes, by name."""
+    leaves = {name: value.detach().clone().requires_grad_() for name, value in gaussians.items()}
+    options = {"sh_degree": 3, "render_mode": "RGB+ED", "packed": False, **options}
+    render, alpha, info = rasterization(**leaves, viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
+    info["means2d"].retain_grad()
+    generator = torch.Generator().manual_seed(1)
+    cotangent = torch.rand(*render.shape[:3], render.shape[3] + 1, generator=generator).to(render)
+    ((render * cotangent[..., :-1]).sum() + (alpha * cotangent[..., -1:]).sum()).backward()
+    results = {"image": render[..., :3], "alpha": alpha, "depth": render[..., 3:]}
+    results.update({f"d {name}": leaf.grad for name, leaf in leaves.items()})  # pyright: ignore[reportArgumentType]
+    results["d means2d"] = info["means2d"].grad
+    if hasattr(info["means2d"], "absgrad"):
+        results["|d means2d|"] = info["means2d"].absgrad
+    return {name: value.detach().to("cpu", torch.float64) for name, value in results.items()}
+
+
+def relative_error(a: Tensor, b: Tensor) -> float:
+    """|a - b| / |b| in the 2-norm."""
+    return float((a - b).norm() / b.norm().clamp_min(1e-300))
+
+
+def bodies() -> dict[str, tuple[Callable, str, torch.dtype]]:
+    """The bodies that this machine has: name to (function, device, dtype)."""
+    found = {"cpu": (cpu.rasterization, "cpu", torch.float32), "cpu float64": (cpu.rasterization, "cpu", torch.float64)}
+    if torch.cuda.is_available():
+        from gsplat.rendering import rasterization
+
+        found["gsplat (our call)"] = (rasterizer("gsplat", "cuda"), "cuda", torch.float32)
+        found["gsplat.rasterization"] = (rasterization, "cuda", torch.float32)
+    return found
+
+
+def compare(n: int, width: int, height: int, size: float) -> Table:
+    """Every body against `reference` in float64: one column each, one row for each result."""
+    scene = random_scene(n, width, height, size, torch.float64)
+    oracle = draw(reference.rasterization, *scene, width, height)
+    table = Table(title=f"relative error against reference in float64: {n} Gaussians, {width} x {height}")
+    table.add_column("")
+    columns = {}
+    for name, (rasterization, device, dtype) in bodies().items():
+        here = [{k: v.to(device, dtype) for k, v in scene[0].items()}, *(t.to(device, dtype) for t in scene[1:])]
+        columns[name] = draw(rasterization, *here, width, height)
+        table.add_column(name)
+    for key in oracle:
+        table.add_row(key, *(f"{relative_error(column[key], oracle[key]):.1e}" for column in columns.values()))
+    return table
+
+
+def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10) -> Table:
+    """Median milliseconds of forward + backward, and their ratio to projection + SH + autograd alone ("floor")."""
+    scene = random_scene(n, width, height, size)
+
+    def floor(gaussians: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> None:
+        leaves = {name: value.detach().clone().requires_grad_() for name, value in gaussians.items()}
+        splats = project(
+            *(leaves[name] for name in PARAMETERS), viewmats[0], Ks[0], width, height,
+            near_plane=0.01, far_plane=1e10, radius_clip=0.0, eps2d=0.3, sh_degree=3, antialiased=False,
+        )  # fmt: skip
+        (splats.means2d.sum() + splats.conics.sum() + splats.opacities.sum() + splats.colors.sum()).backward()
+
+    runs: dict[str, tuple[Callable, list]] = {"floor": (floor, [*scene])}
+    for name, (rasterization, device, dtype) in bodies().items():
+        if dtype == torch.float32:
+            here = [{k: v.to(device) for k, v in scene[0].items()}, *(t.to(device) for t in scene[1:])]
+            runs[name] = (lambda *a, f=rasterization: draw(f, *a, width, height), here)
+    runs["reference"] = (lambda *a: draw(reference.rasterization, *a, width, height), [*scene])
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
+    for repeat in range(repeats + 2):  # interleaved, so that a busy machine slows all alike; two rounds warm up
+        for name, (run, arguments) in runs.items():
+            if name == "reference" and repeat > 3:
+                continue
+            start = time.perf_counter()
+            run(*arguments)
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            seconds[name].append(time.perf_counter() - start)
+    medians = {name: sorted(values[2:])[len(values[2:]) // 2] for name, values in seconds.items()}
+    table = Table(title=f"forward + backward, {n} Gaussians, {width} x {height}, {torch.get_num_threads()} threads")
+    for column in ("", "ms", "x floor"):
+        table.add_column(column)
+    for name, median in medians.items():
+        table.add_row(name, f"{1e3 * median:.1f}", f"{median / medians['floor']:.2f}")
+    return table
+
+
+def main() -> None:
+    """Print both tables with versions."""
+    import gsplat
+    import numba
+
+    console = Console(width=140)
+    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+    console.print(f"{device}, torch {torch.__version__}, gsplat {gsplat.__version__}, numba {numba.__version__}")
+    console.print(compare(2_000, 160, 120, 0.03))
+    console.print(time_bodies(10_000, 256, 256, 0.012))
+
+
+if __name__ == "__main__":
+    main()
