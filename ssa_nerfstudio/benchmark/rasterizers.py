@@ -7,6 +7,7 @@ compared too. Errors are relative in the 2-norm: |a - b| / |b|.
 
 from __future__ import annotations
 
+import importlib.util
 import time
 from collections.abc import Callable
 
@@ -15,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from ssa_nerfstudio.rasterization import cpu, rasterizer, reference
+from ssa_nerfstudio.rasterization import rasterizer, reference
 from ssa_nerfstudio.rasterization.projection import project
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
@@ -83,8 +84,11 @@ def relative_error(a: Tensor, b: Tensor) -> float:
 
 
 def bodies() -> dict[str, tuple[Callable, str, torch.dtype]]:
-    """The bodies that this machine has: name to (function, device, dtype)."""
-    found = {"cpu": (cpu.rasterization, "cpu", torch.float32), "cpu float64": (cpu.rasterization, "cpu", torch.float64)}
+    """The bodies that this machine has (numba for `cpu`, CUDA for gsplat): name to (function, device, dtype)."""
+    found = {}
+    if importlib.util.find_spec("numba"):
+        splatter = rasterizer("cpu", "cpu")
+        found = {"cpu": (splatter, "cpu", torch.float32), "cpu float64": (splatter, "cpu", torch.float64)}
     if torch.cuda.is_available():
         from gsplat.rendering import rasterization
 
@@ -148,12 +152,11 @@ def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10)
 
 def main() -> None:
     """Print both tables with versions."""
-    import gsplat
-    import numba
+    from importlib.metadata import version
 
     console = Console(width=140)
     device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
-    console.print(f"{device}, torch {torch.__version__}, gsplat {gsplat.__version__}, numba {numba.__version__}")
+    console.print(f"{device}, torch {torch.__version__}, gsplat {version('gsplat')}")
     console.print(compare(2_000, 160, 120, 0.03))
     console.print(time_bodies(10_000, 256, 256, 0.012))
 

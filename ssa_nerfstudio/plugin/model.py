@@ -93,7 +93,12 @@ class SSASplatfactoModel(SplatfactoModel):
         self._keys: list[list[float]] = []
         self._group_of_view: list[int] = []
         self.scene_scale = 1.0
+        self.metrics_every = 10
         self._make_strategy()
+        if self.config.rasterizer in ("auto", "cpu") and not torch.cuda.is_available():
+            from ssa_nerfstudio.rasterization.cpu import compile_kernels
+
+            compile_kernels()
 
     def _make_strategy(self) -> None:
         config = self.config
@@ -295,7 +300,12 @@ class SSASplatfactoModel(SplatfactoModel):
         return losses
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
-        """While training: PSNR of the composite against the photo, the number of Gaussians, the mean matte."""
+        """PSNR against the photo, of the clean render and of the composite, and the number of Gaussians.
+
+        While training only at the steps that are logged: at the others nobody would read them.
+        """
+        if self.training and self.step % self.metrics_every:
+            return {}
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         shown = outputs.get("composite")
         values: dict[str, Any] = {"gaussian_count": self.num_points}

@@ -47,6 +47,7 @@ class SSATrainer(Trainer):
 
     def setup_optimizers(self) -> Optimizers:
         """Optimisers of the configuration; the means' learning rate in units of the scene where the model asks for it."""
+        self.pipeline.model.metrics_every = max(1, self.config.logging.steps_per_log)
         scale = self.pipeline.model.scene_scale
         if scale != 1.0:
             means = self.config.optimizers["means"]
