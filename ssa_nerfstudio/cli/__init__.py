@@ -1,0 +1,44 @@
+"""The command `ssa`: one module a command, imported only when it is called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+COMMANDS = {
+    "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
+    "simulate": "Put an artifact in front of the training photos of a nerfstudio dataset.",
+}
+"""Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run `ssa COMMAND [options]`.
+
+    Args:
+        arguments: what follows `ssa`; the process's own where None.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(_usage())
+        raise SystemExit(0 if arguments else 2)
+    name, *rest = arguments
+    if name in ("-V", "--version"):
+        from ssa_nerfstudio import __version__
+
+        print(__version__)
+        return
+    if name not in COMMANDS:
+        from ssa_nerfstudio.errors import refuse
+
+        raise refuse(f"there is no command {name!r}; choose one of {', '.join(COMMANDS)} (ssa --help)")
+    import tyro
+
+    command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+    tyro.cli(command, args=rest, prog=f"ssa {name}", description=COMMANDS[name]).run()
+
+
+def _usage() -> str:
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
+    return "\n".join(["usage: ssa COMMAND [options]", "", *lines, "", "ssa COMMAND --help tells a command's options."])

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.rasterization import _kernels
 from ssa_nerfstudio.rasterization.constants import TILE
+from ssa_nerfstudio.rasterization.cpu_projection import project
 from ssa_nerfstudio.rasterization.interface import rasterization_with
 from ssa_nerfstudio.rasterization.projection import Splats
 from ssa_nerfstudio.threads import on_all_threads
@@ -22,7 +23,7 @@ def blend(
     )  # pyright: ignore[reportReturnType]
 
 
-rasterization = rasterization_with(blend)
+rasterization = rasterization_with(blend, project)
 
 
 def compile_kernels() -> None:
@@ -35,8 +36,9 @@ def compile_kernels() -> None:
     viewmat = torch.eye(4)[None]
     viewmat[0, 2, 3] = 2.0
     image, _, _ = rasterization(
-        one - 1, torch.eye(4)[:1], 0.1 * one, one[:, 0], one, viewmat, torch.eye(3)[None], 1, 1, absgrad=True
-    )
+        one - 1, torch.eye(4)[:1], 0.1 * one, one[:, 0], one[:, None], viewmat, torch.eye(3)[None], 1, 1,
+        sh_degree=0, absgrad=True,
+    )  # fmt: skip
     image.sum().backward()
 
 

@@ -19,8 +19,10 @@ because densification reads them there (and, where `absgrad`, their sum of magni
 """
 
 
-def rasterization_with(blend: Blend) -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
-    """Make a `rasterization` function out of a blending function."""
+def rasterization_with(
+    blend: Blend, project: Callable[..., Splats] = project
+) -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
+    """Make a `rasterization` function out of a blending and a projecting function (`projection.project`)."""
 
     def rasterization(
         means: Tensor,  # [N, 3]

@@ -1,0 +1,5 @@
+"""`python -m ssa_nerfstudio`: the same as `ssa`."""
+
+from ssa_nerfstudio.cli import main
+
+main()

@@ -1,0 +1,103 @@
+"""`projection.project` by numba kernels: what the `cpu` rasterizer projects with."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.rasterization import _projection_kernels as kernels
+from ssa_nerfstudio.rasterization import projection
+from ssa_nerfstudio.rasterization.projection import Splats
+from ssa_nerfstudio.threads import on_all_threads
+
+HIGHEST_DEGREE = 3
+"""Degree of spherical harmonics up to which there is a kernel."""
+
+
+def project(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    *,
+    near_plane: float,
+    far_plane: float,
+    radius_clip: float,
+    eps2d: float,
+    sh_degree: int | None,
+    antialiased: bool,
+) -> Splats:
+    """Same arguments and result as `projection.project`.
+
+    Rare requests go to that one: gradients of the camera (a camera optimiser), antialiasing, harmonics above degree 3.
+    """
+    if viewmat.requires_grad or K.requires_grad or antialiased or (sh_degree or 0) > HIGHEST_DEGREE:
+        return projection.project(
+            means, quats, scales, opacities, colors, viewmat, K, width, height,
+            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, sh_degree=sh_degree,
+            antialiased=antialiased,
+        )  # fmt: skip
+    n = means.shape[0]
+    camera = (viewmat.detach().to(torch.float64).numpy(), K.detach().to(torch.float64).numpy(), width, height)
+    arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (means, quats, scales)]
+    geometry = np.empty((n, 6), arrays[0].dtype)
+    radii = np.empty(n, np.int32)
+    planes = (near_plane, far_plane, radius_clip, eps2d)
+    on_all_threads(kernels.project_gaussians, *arrays, *camera, *planes, geometry, radii)
+    drawn = np.flatnonzero(radii)
+    ids = torch.from_numpy(drawn[np.argsort(geometry[drawn, 5], kind="stable")])
+    splats, shaded = _Project.apply(means, quats, scales, colors, ids, geometry, arrays, camera, eps2d, sh_degree)  # pyright: ignore
+    return Splats(
+        ids=ids,
+        radii=torch.from_numpy(radii)[ids],
+        means2d=splats[:, 0:2],
+        conics=splats[:, 2:5],
+        opacities=opacities[ids],
+        colors=torch.cat([shaded, splats[:, 5:]], dim=-1),
+    )
+
+
+class _Project(torch.autograd.Function):
+    """Autograd's door to the projection kernels: geometry [V, 6] and colour [V, 3] of the drawn Gaussians."""
+
+    @staticmethod
+    def forward(ctx, means, quats, scales, colors, ids, geometry, arrays, camera, eps2d, sh_degree):  # pyright: ignore
+        coefficients = np.ascontiguousarray(colors.detach().numpy())
+        if sh_degree is None:
+            shaded = coefficients[ids.numpy()]
+        else:
+            shaded = np.empty((len(ids), 3), geometry.dtype)
+            on_all_threads(kernels.shade, ids.numpy(), arrays[0], _centre(camera[0]), coefficients, sh_degree, shaded)
+        ctx.saved = (ids, arrays, coefficients, shaded, camera, eps2d, sh_degree)
+        return torch.from_numpy(geometry[ids.numpy()]), torch.from_numpy(shaded)
+
+    @staticmethod
+    def backward(ctx, v_splats, v_shaded):  # pyright: ignore[reportIncompatibleMethodOverride]
+        ids, arrays, coefficients, shaded, camera, eps2d, sh_degree = ctx.saved
+        numbers = ids.numpy()
+        v_means, v_quats, v_scales = (np.zeros_like(array) for array in arrays)
+        v_colors = np.zeros_like(coefficients)
+        pulled = v_splats.contiguous().numpy()
+        on_all_threads(
+            kernels.backpropagate_projection, numbers, *arrays, *camera, eps2d, pulled, v_means, v_quats, v_scales
+        )
+        v = v_shaded.contiguous().numpy()
+        if sh_degree is None:
+            v_colors[numbers] = v
+        else:
+            on_all_threads(
+                kernels.backpropagate_shading,
+                numbers, arrays[0], _centre(camera[0]), coefficients, sh_degree, shaded, v, v_means, v_colors,
+            )  # fmt: skip
+        return *(torch.from_numpy(g) for g in (v_means, v_quats, v_scales, v_colors)), *[None] * 6
+
+
+def _centre(viewmat: np.ndarray) -> np.ndarray:
+    """World position [3] of the camera of a rigid world-to-camera matrix [4, 4]."""
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
