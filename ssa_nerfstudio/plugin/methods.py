@@ -7,16 +7,17 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from ssa_nerfstudio.plugin import upstream
+from ssa_nerfstudio.plugin import open3d_libraries, upstream
 from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipelineConfig
 from ssa_nerfstudio.plugin.trainer import FusedAdamConfig, SSATrainerConfig, machine
 
 # Every nerfstudio command imports this module through the entry points, before it loads or renders anything.
-upstream.preload_libusb()
+open3d_libraries.preload()
 upstream.allow_checkpoint_scalars()
 upstream.give_mcmc_a_cpu_body()
+upstream.bring_ffmpeg()
 
 
 def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:

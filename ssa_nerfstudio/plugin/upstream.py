@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
-import ctypes
 import importlib.util
 import math
-import sys
+import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 
 import gsplat.strategy.ops
@@ -14,23 +16,8 @@ import numpy as np
 import torch
 import torchmetrics.image.lpip
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from nerfstudio.utils import install_checks
 from torch import Tensor
-
-
-def preload_libusb() -> None:
-    """Load libusb before open3d looks for it: open3d's wheels link to it and do not bring it, and slim systems have none.
-
-    nerfstudio reads its seed points and writes exports with open3d. The library comes from the wheel `libusb-package`;
-    may go when open3d's wheels bring it.
-    """
-    if sys.platform != "linux" or importlib.util.find_spec("libusb_package") is None:
-        return
-    try:
-        ctypes.CDLL("libusb-1.0.so.0", mode=ctypes.RTLD_GLOBAL)
-    except OSError:
-        import libusb_package
-
-        ctypes.CDLL(str(libusb_package.get_library_path()), mode=ctypes.RTLD_GLOBAL)
 
 
 def allow_checkpoint_scalars() -> None:
@@ -52,6 +39,27 @@ def allow_checkpoint_scalars() -> None:
             *{type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64, np.bool_)},
         ]
     )
+
+
+def bring_ffmpeg() -> None:
+    """Let `ns-render` find an ffmpeg, which it demands even where it writes images: the one of `imageio-ffmpeg`.
+
+    Looked for only when nerfstudio asks, and not where the system has one. May go when `ns-render` asks for it only
+    for videos.
+    """
+    check = install_checks.check_ffmpeg_installed
+
+    def check_ffmpeg_installed() -> None:
+        if shutil.which("ffmpeg") is None and importlib.util.find_spec("imageio_ffmpeg"):
+            import imageio_ffmpeg
+
+            folder = tempfile.mkdtemp(prefix="ssa-ffmpeg-")
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            os.symlink(imageio_ffmpeg.get_ffmpeg_exe(), os.path.join(folder, "ffmpeg"))
+            os.environ["PATH"] = os.pathsep.join([folder, os.environ.get("PATH", "")])
+        check()
+
+    install_checks.check_ffmpeg_installed = check_ffmpeg_installed
 
 
 @contextlib.contextmanager

@@ -1,0 +1,43 @@
+# Everything runs in .venv, which is made when it is missing and brought up to date when pyproject.toml has changed.
+#   make demo                  the built-in scene, about three minutes on two cores without a GPU
+#   make demo DATA=folder      the same comparison on your nerfstudio dataset
+#   make test, make lint       what .ci/run runs
+
+VENV := .venv
+READY := $(VENV)/.ready
+BIN := $(VENV)/bin
+# The first Python that nerfstudio 1.1.5 supports, found by running it: version managers' shims exist without working.
+PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3 python; do \
+	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' 2>/dev/null && echo $$p && break; done)
+DATA ?=
+DEMO_OPTIONS ?=
+
+.PHONY: setup demo test lint format clean
+
+setup: $(READY)
+
+$(READY): pyproject.toml Makefile
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.10, 3.11 or 3.12 found; install one or call make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "error: $(PYTHON) cannot make environments; install its venv package (Debian: apt install python3-venv)" >&2; exit 2; }
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --editable '.[dev]'
+	$(BIN)/python -m ssa_nerfstudio.plugin.open3d_libraries
+	@touch $@
+
+demo: $(READY)
+	$(BIN)/ssa demo $(if $(DATA),--data $(DATA)) $(DEMO_OPTIONS)
+
+test: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+format: $(READY)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) outputs build *.egg-info

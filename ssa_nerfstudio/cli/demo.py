@@ -1,0 +1,64 @@
+"""`ssa demo`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ssa_nerfstudio.errors import refuse
+
+
+@dataclass
+class Command:
+    """Options of `ssa demo`."""
+
+    output: Path = Path("outputs/demo")
+    """Folder for report.html, sheet.png, results.json, the datasets and the trained models."""
+    data: Path | None = None
+    """A nerfstudio dataset to show instead of the built-in scene; trained as it is, no artifact is added."""
+    steps: int = 600
+    """Training steps of each run; schedules are scaled to it. A capture of megapixels wants thousands and a GPU."""
+    scale_factor: float = 1.0
+    """Photos of --data are resized by this, in (0, 1]."""
+
+    def run(self) -> None:
+        """Train, print the tables, write the report."""
+        if self.steps < 1 or not 0 < self.scale_factor <= 1:
+            raise refuse("--steps must be at least 1 and --scale-factor in (0, 1]")
+        if self.data is not None:
+            from ssa_nerfstudio.plugin.inputs import check_transforms
+
+            check_transforms(self.data)
+        console = Console()
+        console.print("Loading nerfstudio ...")
+        from ssa_nerfstudio.demo import report, run
+
+        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=console) as progress:
+            tasks = {}
+
+            def on_step(dataset: str, method: str, step: int) -> None:
+                key = dataset, method
+                if key not in tasks:
+                    tasks[key] = progress.add_task(f"{dataset}: {method}", total=self.steps)
+                progress.update(tasks[key], completed=step)
+
+            if self.data is None:
+                demonstration = run.demonstrate(self.output, self.steps, on_step)
+            else:
+                name = self.data.resolve().stem
+                runs = self.output / "runs"
+                compared = run.compare(name, self.data, runs, self.steps, on_step, {}, self.scale_factor)
+                demonstration = run.Demonstration([compared])
+        command = f"ssa demo --steps {self.steps}"
+        if self.data is not None:
+            command += f" --data {self.data} --scale-factor {self.scale_factor}"
+        page = report.write_report(demonstration, self.output, command)
+        for comparison in demonstration.comparisons:
+            console.print(report.console_table(comparison))
+            if not comparison.clean_test_views:
+                console.print(report.CORRUPTED, style="yellow")
+        console.print(f"Pictures and figures: {page}")
