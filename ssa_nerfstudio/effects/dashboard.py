@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssa_nerfstudio.effects.layers import Layers
+from ssa_nerfstudio.effects.ranges import require, require_colours
 
 Colour = tuple[int, int, int]
 
@@ -39,14 +40,8 @@ class Dashboard:
     """Screen in the middle of the car, sRGB, 0..255."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.height <= 0.5:
-            raise ValueError(f"Dashboard.height must be in (0, 0.5], got {self.height}")
-        if not 0.5 <= self.softness <= 50:
-            raise ValueError(f"Dashboard.softness must be in [0.5, 50], got {self.softness}")
-        for name in ("panel", "cluster", "dial", "needle", "wheel", "screen"):
-            colour = getattr(self, f"{name}_colour")
-            if len(colour) != 3 or not all(0 <= channel <= 255 for channel in colour):
-                raise ValueError(f"Dashboard.{name}_colour must be three numbers in 0..255, got {colour}")
+        require(self, height="(0, 0.5]", softness="[0.5, 50]")
+        require_colours(self, *(f"{part}_colour" for part in ("panel", "cluster", "dial", "needle", "wheel", "screen")))
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
         """The dashboard at one frame size.

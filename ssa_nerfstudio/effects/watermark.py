@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ssa_nerfstudio.effects.layers import Layers
+from ssa_nerfstudio.effects.ranges import require, require_colours
 
 _OVERSAMPLING = 4
 
@@ -30,11 +31,8 @@ class Watermark:
     """The line beneath the logo; not empty."""
 
     def __post_init__(self) -> None:
-        for name in ("alpha", "size"):
-            if not 0 < getattr(self, name) <= 1:
-                raise ValueError(f"Watermark.{name} must be in (0, 1], got {getattr(self, name)}")
-        if len(self.colour) != 3 or not all(0 <= channel <= 255 for channel in self.colour):
-            raise ValueError(f"Watermark.colour must be three numbers in 0..255, got {self.colour}")
+        require(self, alpha="(0, 1]", size="(0, 1]")
+        require_colours(self, "colour")
         if not self.text.strip():
             raise ValueError(f"Watermark.text must not be empty, got {self.text!r}")
 

@@ -1,0 +1,60 @@
+"""`ssa simulate`: the arguments and what they are handed to."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from ssa_nerfstudio.errors import refuse
+
+
+@dataclass
+class Command:
+    """Put an artifact in front of the training photos of a nerfstudio dataset; test photos stay clean."""
+
+    data: Path
+    """Dataset to read: the folder with transforms.json, or the .json file."""
+    output: Path
+    """Dataset to write; must not exist."""
+    effects: tuple[str, ...] | None = None
+    """Effects, from the scene outwards: names or .yaml files. None at all copies the dataset and adds the split."""
+    scene: str | None = None
+    """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats it."""
+    seed: int | None = None
+    """Decides all that chance decides, not negative; the scene's own, or 0, where not given."""
+    eval_interval: int = 8
+    """Every so many photos, in sorted order, one is for testing; ignored where transforms.json has a split."""
+    downscale_factor: int = 1
+    """Read the photos from images_N and write a dataset of that size."""
+    threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Photos worked on at once."""
+
+    def run(self) -> None:
+        """Simulate, and say what to do next.
+
+        Raises:
+            BadInput: the arguments, the dataset or a configuration cannot be worked with.
+        """
+        from rich.console import Console
+
+        from ssa_nerfstudio.simulation.dataset import Dataset
+        from ssa_nerfstudio.simulation.scene import Scene, read_effects, read_scene
+        from ssa_nerfstudio.simulation.simulate import simulate
+
+        if (self.effects is None) == (self.scene is None):
+            raise refuse("say what to simulate: either --effects NAME ... or --scene NAME")
+        for name, lowest in (("seed", 0), ("threads", 1)):
+            if (value := getattr(self, name)) is not None and value < lowest:
+                raise refuse(f"--{name} must be at least {lowest}, got {value}")
+        scene = Scene(read_effects(self.effects)) if self.effects is not None else read_scene(str(self.scene))
+        if self.seed is not None:
+            scene = dataclasses.replace(scene, seed=self.seed)
+        dataset = Dataset.read(self.data, self.eval_interval, self.downscale_factor)
+        simulate(dataset, scene, self.output, self.threads)
+
+        train, _, test = dataset.split
+        console = Console()
+        console.print(f"{self.output}: {len(train)} training photos, {len(test)} clean test photos", highlight=False)
+        console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}", highlight=False)

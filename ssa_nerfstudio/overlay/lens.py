@@ -1,0 +1,163 @@
+"""Raw frame and undistorted frame: the warp, the crop and the intrinsics with which nerfstudio prepares photos."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of one camera as nerfstudio's transforms.json states them; (0, 0) is a corner of the corner pixel.
+
+    Raises:
+        ValueError: the size is not positive, a value is not finite, or nerfstudio cannot undistort such a lens.
+    """
+
+    width: int
+    """Frame width, pixels."""
+    height: int
+    """Frame height, pixels."""
+    fx: float
+    """Focal length along x, pixels."""
+    fy: float
+    """Focal length along y, pixels."""
+    cx: float
+    """Principal point, pixels from the left edge."""
+    cy: float
+    """Principal point, pixels from the upper edge."""
+    distortion: tuple[float, ...] = (0.0,) * 6
+    """k1, k2, k3, k4, p1, p2; a perspective camera has no k4, a fisheye uses k1 to k4."""
+    model: Literal["perspective", "fisheye"] = "perspective"
+    """OpenCV's pinhole model (transforms.json: OPENCV and simpler ones) or its fisheye (OPENCV_FISHEYE)."""
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"frame must be at least 1 x 1 pixels, got {self.width} x {self.height}")
+        if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
+            raise ValueError("intrinsics must be finite")
+        if len(self.distortion) != 6:
+            raise ValueError(f"distortion must be k1, k2, k3, k4, p1, p2, got {len(self.distortion)} values")
+        if self.model == "perspective" and self.distortion[3] != 0:
+            raise ValueError(f"nerfstudio undistorts no perspective camera with k4, got {self.distortion[3]}")
+
+    @property
+    def distorted(self) -> bool:
+        """Whether nerfstudio warps photos of this lens at all."""
+        return any(self.distortion)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """K [3, 3] float32 in OpenCV's convention, where (0, 0) is the centre of the corner pixel."""
+        matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float32)
+        # In float32 as nerfstudio does it, so that the crop comes out the same to the pixel.
+        matrix[:2, 2] = matrix[:2, 2] - 0.5
+        return matrix
+
+    @property
+    def coefficients(self) -> np.ndarray:
+        """Distortion in OpenCV's order: k1, k2, p1, p2, k3, k4, 0, 0 (perspective) or k1 to k4 (fisheye)."""
+        k1, k2, k3, k4, p1, p2 = (float(np.float32(value)) for value in self.distortion)
+        return np.array([k1, k2, k3, k4] if self.model == "fisheye" else [k1, k2, p1, p2, k3, k4, 0, 0])
+
+
+def undistorted(lens: Lens) -> Lens:
+    """The camera after undistortion and crop, as nerfstudio 1.1.5 computes it (`_undistort_image`).
+
+    Perspective: `cv2.getOptimalNewCameraMatrix` with alpha 0, cropped to its region of interest. Fisheye:
+    `cv2.fisheye.estimateNewCameraMatrixForUndistortRectify` with balance 0, not cropped.
+    """
+    return _target(lens)[0]
+
+
+def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
+    """A picture of the raw frame, in the undistorted frame.
+
+    Bilinear, as nerfstudio warps photos. T and B = A W of an artifact are warped each for itself (premultiplied);
+    their straight colour must not be. Where the lens has no distortion the picture is returned as it is.
+
+    Args:
+        image: uint8 or float32 [H, W, C] of the lens' size.
+
+    Returns:
+        [H', W', C] of `undistorted(lens)`'s size; 0 outside the raw frame, where photos are black too.
+
+    Raises:
+        ValueError: the image is not of the lens' size.
+    """
+    _check_size(image, lens)
+    if not lens.distorted:
+        return image
+    target, matrix, (x, y) = _target(lens)
+    if lens.model == "fisheye":
+        maps = cv2.fisheye.initUndistortRectifyMap(
+            lens.matrix, lens.coefficients, np.eye(3), matrix, (lens.width, lens.height), cv2.CV_32FC1
+        )
+        return cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
+    warped = cv2.undistort(image, lens.matrix, lens.coefficients, None, matrix)
+    return np.ascontiguousarray(warped[y : y + target.height, x : x + target.width])
+
+
+def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
+    """A picture of the undistorted frame, in the raw frame: the inverse of `undistort`, bilinear.
+
+    Args:
+        image: uint8 or float32 [H', W', C] of `undistorted(lens)`'s size.
+        lens: the raw frame's lens.
+        fill: value where the crop left nothing to show: 1 for T and 0 for B leaves the photo there as it is.
+
+    Returns:
+        [H, W, C] of the lens' size.
+
+    Raises:
+        ValueError: the image is not of the undistorted size.
+    """
+    if not lens.distorted:
+        _check_size(image, lens)
+        return image
+    target, matrix, (x, y) = _target(lens)
+    _check_size(image, target)
+    pixels = np.stack(np.meshgrid(np.arange(lens.width), np.arange(lens.height)), axis=-1).reshape(-1, 1, 2)
+    pixels = pixels.astype(np.float64)
+    if lens.model == "fisheye":
+        rays = cv2.fisheye.undistortPoints(pixels, lens.matrix, lens.coefficients, np.eye(3), matrix)
+    else:
+        precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
+        rays = cv2.undistortPointsIter(pixels, lens.matrix, lens.coefficients, np.eye(3), matrix, precise)
+    places = (rays.reshape(lens.height, lens.width, 2) - (x, y)).astype(np.float32)
+    border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (fill,) * 4}
+    return cv2.remap(image, places, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
+
+
+def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
+    """The undistorted camera, its K [3, 3] before the crop (OpenCV's convention), and the crop's corner (x, y)."""
+    if not lens.distorted:
+        return lens, lens.matrix, (0, 0)
+    width, height, x, y = lens.width, lens.height, 0, 0
+    if lens.model == "fisheye":
+        matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
+            lens.matrix, lens.coefficients, (width, height), np.eye(3), balance=0
+        )
+    else:
+        matrix, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(
+            lens.matrix, lens.coefficients, (width, height), 0
+        )
+    if width < 1 or height < 1:
+        raise ValueError(f"undistorting with {lens.distortion} leaves no pixel of {lens.width} x {lens.height}")
+    target = Lens(
+        width=width,
+        height=height,
+        fx=float(matrix[0, 0]),
+        fy=float(matrix[1, 1]),
+        cx=float(matrix[0, 2]) - x + 0.5,
+        cy=float(matrix[1, 2]) - y + 0.5,
+    )
+    return target, matrix, (x, y)
+
+
+def _check_size(image: np.ndarray, lens: Lens) -> None:
+    if image.shape[:2] != (lens.height, lens.width):
+        raise ValueError(f"image is {image.shape[1]} x {image.shape[0]}, the lens' frame {lens.width} x {lens.height}")

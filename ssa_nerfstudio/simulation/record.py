@@ -1,0 +1,66 @@
+"""What the simulator writes beside the photos: transforms.json with its split, and scene.yaml."""
+
+from __future__ import annotations
+
+import copy
+import importlib.metadata
+import platform
+from typing import Any
+
+import yaml
+
+from ssa_nerfstudio import __version__
+from ssa_nerfstudio.simulation.dataset import Dataset
+from ssa_nerfstudio.simulation.scene import Scene
+
+
+def transforms(dataset: Dataset, names: dict[str, str]) -> dict[str, Any]:
+    """transforms.json of the output: the input's, with the split, the photos' new names and the size that was read.
+
+    Args:
+        dataset: the input.
+        names: each photo's path in the output.
+    """
+    meta = copy.deepcopy(dataset.meta)
+    for frame in meta["frames"]:
+        frame["file_path"] = names[frame["file_path"]]
+    for split, paths in zip(("train", "val", "test"), dataset.split, strict=True):
+        meta[f"{split}_filenames"] = [names[path] for path in paths]
+    if dataset.downscale_factor > 1:
+        for holder in (meta, *meta["frames"]):
+            holder |= {
+                key: holder[key] / dataset.downscale_factor for key in ("fl_x", "fl_y", "cx", "cy") if key in holder
+            }
+            holder |= {key: int(holder[key] / dataset.downscale_factor) for key in ("w", "h") if key in holder}
+    return meta
+
+
+def scene_record(dataset: Dataset, scene: Scene) -> str:
+    """YAML of what was done; it is a scene file itself, and repeats the run.
+
+    Args:
+        dataset: the input.
+        scene: what was put in front.
+    """
+    train, val, test = dataset.split
+    libraries = ["numpy", "opencv-python-headless", "Pillow"]
+    if any(name in ("rain", "mud") for name, _ in scene.effects):
+        libraries.append("albumentations")
+    record = {
+        "effects": scene.describe(),
+        "seed": scene.seed,
+        "provenance": {
+            "data": str(dataset.root),
+            "downscale_factor": dataset.downscale_factor,
+            "split": f"every {dataset.eval_interval}th view tests" if dataset.split_by_interval else "transforms.json",
+            "views": {"train": len(train), "val": len(val), "test": len(test)},
+            "formation": "I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits; several effects are composed "
+            "in order, T = T2 T1 and B = T2 B1 + B2, and clipped once",
+            "versions": {
+                "python": platform.python_version(),
+                "ssa-nerfstudio": __version__,
+                **{library: importlib.metadata.version(library) for library in libraries},
+            },
+        },
+    }
+    return yaml.safe_dump(record, sort_keys=False, allow_unicode=True, width=120)
