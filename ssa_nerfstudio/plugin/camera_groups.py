@@ -1,30 +1,24 @@
-"""Which cameras share an artifact: those of one frame size and one set of intrinsics."""
+"""nerfstudio's cameras and the artifact groups they belong to (`overlay.camera_groups`)."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
-SAME_INTRINSICS = 1e-3
-"""Focal lengths and principal points closer than this (relative to the frame's width) are one camera's."""
+from ssa_nerfstudio.overlay.camera_groups import group_frames, same_intrinsics
 
 
 def group_cameras(cameras: Cameras) -> tuple[Tensor, list[int]]:
     """Sort cameras into groups that each get an overlay of their own, in order of first appearance.
 
-    A rig's cameras differ in their intrinsics and are kept apart. Where structure-from-motion gave every photo
-    intrinsics of its own (more than half of the groups would hold a single view), they tell nothing, and photos of one
-    size form one group.
-
     Returns:
         keys [G, 6] float64 (width, height, fx, fy, cx, cy of each group's first camera), and each camera's group.
     """
     described = describe(cameras)
-    keys, groups = _group(described, by_intrinsics=True)
-    if len(keys) > 1 and sum(groups.count(g) == 1 for g in range(len(keys))) > len(keys) / 2:
-        keys, groups = _group(described, by_intrinsics=False)
-    return torch.stack(keys), groups
+    groups = group_frames(described.numpy())
+    return torch.stack([described[groups.index(g)] for g in range(max(groups) + 1)]), groups
 
 
 def match_camera(camera: Cameras, keys: list[list[float]]) -> int | None:
@@ -32,7 +26,7 @@ def match_camera(camera: Cameras, keys: list[list[float]]) -> int | None:
     described = describe(camera)[0]
     candidates = [g for g, key in enumerate(keys) if key[:2] == described[:2].tolist()]
     for g in candidates:
-        if _same_intrinsics(described, torch.tensor(keys[g], dtype=torch.float64)):
+        if same_intrinsics(described.numpy(), np.array(keys[g])):
             return g
     return candidates[0] if candidates else None
 
@@ -51,20 +45,3 @@ def describe(cameras: Cameras) -> Tensor:
     fields = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy)
     return torch.stack([f.reshape(-1).to("cpu", torch.float64) for f in fields], dim=-1)
 
-
-def _group(described: Tensor, by_intrinsics: bool) -> tuple[list[Tensor], list[int]]:
-    keys: list[Tensor] = []
-    groups: list[int] = []
-    for camera in described:
-        for g, key in enumerate(keys):
-            if torch.equal(camera[:2], key[:2]) and (not by_intrinsics or _same_intrinsics(camera, key)):
-                groups.append(g)
-                break
-        else:
-            groups.append(len(keys))
-            keys.append(camera)
-    return keys, groups
-
-
-def _same_intrinsics(a: Tensor, b: Tensor) -> bool:
-    return bool((a[2:] - b[2:]).abs().max() <= SAME_INTRINSICS * a[0])

@@ -25,6 +25,17 @@ def check_device(device: torch.device | str) -> None:
         )
 
 
+def check_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
+    """Refuse to resume from a folder without checkpoints or a file that does not exist."""
+    if load_dir is None:
+        if load_checkpoint is not None and not load_checkpoint.exists():
+            raise refuse(f"--load-checkpoint {load_checkpoint} does not exist; give a step-*.ckpt of an earlier run")
+        return
+    pattern = "step-*.ckpt" if load_step is None else f"step-{load_step:09d}.ckpt"
+    if not list(load_dir.glob(pattern)):
+        raise refuse(f"--load-dir {load_dir} holds no {pattern}; give the nerfstudio_models folder of an earlier run")
+
+
 def check_transforms(data: Path) -> None:
     """Refuse a nerfstudio dataset whose transforms.json is missing, unreadable, empty, or holds broken poses.
 

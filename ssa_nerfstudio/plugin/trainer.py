@@ -9,7 +9,7 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ssa_nerfstudio.plugin.inputs import check_device
+from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.schedules import scaled
 
 
@@ -54,6 +54,10 @@ class SSATrainer(Trainer):
             means["optimizer"].lr *= scale
             means["scheduler"].lr_final *= scale
         return super().setup_optimizers()
+
+    def _load_checkpoint(self) -> None:
+        check_checkpoint(self.config.load_dir, self.config.load_step, self.config.load_checkpoint)
+        super()._load_checkpoint()
 
     def train(self) -> None:
         """Train up to max_num_iterations steps in all; upstream's resumed runs train that many more."""
