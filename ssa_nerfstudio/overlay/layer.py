@@ -50,6 +50,7 @@ class ScreenSpaceOverlay(nn.Module):
         color, alpha = CONSTANT_START
         self.color_logits = nn.Parameter(torch.full((*size, 3), color).logit())
         self.alpha_logits = nn.Parameter(torch.full((*size, 1), alpha).logit())
+        # Lets a checkpoint say how large its overlay is, before any photo has been opened.
         self.register_buffer("frame", torch.tensor([height, width, resolution]))
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.height, self.width, self.resolution = height, width, resolution
@@ -122,6 +123,7 @@ class GivenOverlay(nn.Module):
         self.register_buffer("transmittance", transmittance.float())
         self.register_buffer("addition", addition.float())
         self.height, self.width = transmittance.shape[:2]
+        self.register_buffer("frame", torch.tensor([self.height, self.width, 1]))
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """T and B [H // reduction, W // reduction, 3], averaged."""

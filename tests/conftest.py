@@ -1,0 +1,47 @@
+"""What the tests share: where real captures are, and a tiny scene with a dashboard in front of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ssa_nerfstudio.demo.scene import DemoScene
+from ssa_nerfstudio.effects.dashboard import Dashboard
+
+torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def captures() -> Path:
+    """The folder of real captures: $SSA_DATA, or data/ in the working directory."""
+    folder = Path(os.environ.get("SSA_DATA", "data"))
+    if not (folder / "fox" / "transforms.json").exists():
+        pytest.skip(f"no real captures in {folder}; set SSA_DATA to the folder that holds fox, plush, ...")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of 12 training views of 64 x 48 pixels behind a dashboard, and 3 clean test views. Read only."""
+    scene = DemoScene(views=12, test_views=3, width=64, height=48)
+    folder = tmp_path_factory.mktemp("scene") / "dashboard"
+    scene.write(folder, Dashboard().layers(scene.height, scene.width, np.random.default_rng(0)))
+    return folder
+
+
+@pytest.fixture
+def broken_scene(tiny_scene: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny scene for a test to break."""
+    return Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+
+
+def edit_transforms(scene: Path, **changes) -> None:
+    """Replace entries of a scene's transforms.json."""
+    path = scene / "transforms.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))

@@ -1,0 +1,164 @@
+"""What cannot be worked with ends in one line that names the culprit and the remedy, and exit code 2."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
+from ssa_nerfstudio.errors import BadInput
+
+
+def refusal(capsys: pytest.CaptureFixture, run: Callable) -> str:
+    """The one line with which `run` is refused."""
+    with pytest.raises(BadInput) as caught:
+        run()
+    assert caught.value.code == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ssa-nerfstudio: error:")]
+    assert len(lines) == 1
+    return lines[0]
+
+
+def train(data: Path, output: Path, steps: int = 2, **changes) -> None:
+    config = configure("ssa-splatfacto", data, output, steps, {"num_downscales": 0})
+    for name, value in changes.items():
+        setattr(config, name, value)
+    train_and_evaluate(config)
+
+
+def edit_frames(scene: Path, edit: Callable[[list[dict]], list[dict]]) -> None:
+    path = scene / "transforms.json"
+    transforms = json.loads(path.read_text())
+    transforms["frames"] = edit(transforms["frames"])
+    for split in ("train", "val", "test"):
+        transforms.pop(f"{split}_filenames")
+    path.write_text(json.dumps(transforms))
+
+
+def test_a_folder_that_does_not_exist_is_named(tmp_path, capsys):
+    assert str(tmp_path / "nowhere") in refusal(capsys, lambda: train(tmp_path / "nowhere", tmp_path))
+
+
+def test_a_folder_without_transforms_tells_how_to_make_them(tmp_path, capsys):
+    assert "ns-process-data" in refusal(capsys, lambda: train(tmp_path, tmp_path / "out"))
+
+
+def test_a_dataset_without_photos_is_refused(broken_scene, tmp_path, capsys):
+    edit_frames(broken_scene, lambda frames: [])
+    assert "lists 0 photos" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_a_single_photo_is_refused(broken_scene, tmp_path, capsys):
+    edit_frames(broken_scene, lambda frames: frames[:1])
+    assert "lists 1 photos; at least 2" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_a_split_that_leaves_one_photo_to_train_on_is_refused(broken_scene, tmp_path, capsys):
+    edit_frames(broken_scene, lambda frames: frames[:2])
+    assert "leaves 1 photos to train on" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_a_missing_photo_is_named(broken_scene, tmp_path, capsys):
+    (broken_scene / "images" / "train_0003.png").unlink()
+    assert "train_0003.png, which does not exist" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_a_truncated_photo_is_named(broken_scene, tmp_path, capsys):
+    photo = broken_scene / "images" / "train_0004.png"
+    photo.write_bytes(photo.read_bytes()[:200])
+    message = refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+    assert "train_0004.png cannot be read as a photo" in message
+    assert "remove its frame" in message
+
+
+def test_a_text_file_named_like_a_photo_is_named(broken_scene, tmp_path, capsys):
+    (broken_scene / "images" / "train_0005.png").write_text("no photo")
+    assert "train_0005.png cannot be read as a photo" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_a_photo_of_another_size_is_refused(broken_scene, tmp_path, capsys):
+    from PIL import Image
+
+    path = broken_scene / "images" / "train_0002.png"
+    Image.open(path).resize((32, 24)).save(path)
+    assert "does not match the camera" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), "x", None])
+def test_a_pose_that_is_no_number_names_its_photo(broken_scene, tmp_path, capsys, value):
+    def spoil(frames: list[dict]) -> list[dict]:
+        frames[7]["transform_matrix"][1][3] = value
+        return frames
+
+    name = json.loads((broken_scene / "transforms.json").read_text())["frames"][7]["file_path"]
+    edit_frames(broken_scene, spoil)
+    assert f"the pose of {name}" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_transforms_that_are_no_json_are_named(broken_scene, tmp_path, capsys):
+    (broken_scene / "transforms.json").write_text("{")
+    assert "transforms.json is no valid JSON" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
+def test_cuda_where_there_is_none_is_refused_with_the_flag_that_helps(tiny_scene, tmp_path, capsys):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2)
+    config.machine.device_type = "cuda"
+    assert "--machine.device-type cpu" in refusal(capsys, lambda: train_and_evaluate(config))
+
+
+def test_resuming_with_photos_of_another_size_is_refused(tiny_scene, tmp_path, capsys):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+    _, _, path = train_and_evaluate(config)
+    other = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0}, scale_factor=0.5)
+    other.load_dir = path.parent / "nerfstudio_models"
+    message = refusal(capsys, lambda: train_and_evaluate(other))
+    assert "(48, 64, 1)" in message
+    assert "(24, 32, 1)" in message
+
+
+def test_resuming_an_overlay_without_one_is_refused(tiny_scene, tmp_path, capsys):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+    _, _, path = train_and_evaluate(config)
+    other = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "off"})
+    other.load_dir = path.parent / "nerfstudio_models"
+    assert "--pipeline.model.overlay on" in refusal(capsys, lambda: train_and_evaluate(other))
+
+
+def test_resuming_from_an_empty_folder_is_refused(tiny_scene, tmp_path, capsys):
+    assert "holds no step-*.ckpt" in refusal(capsys, lambda: train(tiny_scene, tmp_path / "out", load_dir=tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("arrays", "complaint"),
+    [
+        ({"T": np.ones((48, 64, 3))}, "holds no usable layers"),
+        ({"T": np.ones((48, 64)), "B": np.ones((48, 64))}, "must both be [H, W, 3]"),
+        ({"T": np.full((48, 64, 3), 2.0), "B": np.zeros((48, 64, 3))}, "T must lie in [0, 1]"),
+        ({"T": np.full((48, 64, 3), np.nan), "B": np.zeros((48, 64, 3))}, "not finite"),
+        ({"T": np.ones((24, 32, 3)), "B": np.zeros((24, 32, 3))}, "48 x 64"),
+    ],
+)
+def test_given_layers_that_do_not_fit_are_refused(tiny_scene, tmp_path, capsys, arrays, complaint):
+    path = tmp_path / "layers.npz"
+    np.savez(path, **arrays)
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"overlay": "given", "overlay_given": path})
+    assert complaint in refusal(capsys, lambda: train_and_evaluate(config))
+
+
+def test_the_command_line_ends_with_the_line_alone_and_exit_code_2(broken_scene, tmp_path):
+    photo = broken_scene / "images" / "train_0004.png"
+    photo.write_bytes(photo.read_bytes()[:200])
+    command = [str(Path(sys.executable).with_name("ns-train")), "ssa-splatfacto", "--data", str(broken_scene)]
+    options = ["--vis", "tensorboard", "--output-dir", str(tmp_path / "out")]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert "train_0004.png cannot be read as a photo" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,263 @@
+"""Training in nerfstudio: what the methods build, what they learn, and that resuming goes on where a run stopped."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import edit_transforms
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils.eval_utils import eval_setup
+
+from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
+from ssa_nerfstudio.effects.dashboard import Dashboard
+from ssa_nerfstudio.overlay.statistics import accumulate
+from ssa_nerfstudio.plugin.schedules import scaled
+
+
+def run(data: Path, output: Path, steps: int, method: str = "ssa-splatfacto", **model):
+    return train_and_evaluate(configure(method, data, output, steps, {"num_downscales": 0, **model}))
+
+
+def dashboard_layers(path: Path) -> Path:
+    layers = Dashboard().layers(48, 64, np.random.default_rng(0))
+    np.savez(path, T=layers.transmittance, B=layers.addition)
+    return path
+
+
+@pytest.fixture(scope="module")
+def trained(tiny_scene, tmp_path_factory):
+    """80 steps without, with a learned and with the true overlay, on the same scene."""
+    folder = tmp_path_factory.mktemp("trained")
+    given = dashboard_layers(folder / "layers.npz")
+    return {
+        "off": run(tiny_scene, folder, 80, overlay="off"),
+        "on": run(tiny_scene, folder, 80),
+        "given": run(tiny_scene, folder, 80, overlay="given", overlay_given=given),
+    }
+
+
+def test_an_overlay_recovers_the_scene_behind_a_dashboard(trained):
+    psnr = {name: outcome.metrics["psnr"] for name, (outcome, _, _) in trained.items()}
+    assert psnr["on"] > psnr["off"] + 1.0
+    assert psnr["given"] > psnr["off"] + 1.0
+
+
+def test_the_matte_learned_is_the_dashboard(trained):
+    _, pipeline, _ = trained["on"]
+    truth = Dashboard().layers(48, 64, np.random.default_rng(0)).matte
+    matte = pipeline.model.overlays[0].matte().detach().numpy()[..., 0]
+    assert matte[truth > 0.99].mean() > 0.9
+    assert matte[truth < 0.01].mean() < 0.15
+
+
+def test_rgb_is_the_clean_render_and_the_composite_is_what_the_photo_shows(trained):
+    _, pipeline, _ = trained["on"]
+    pipeline.eval()
+    camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]
+    drawn = pipeline.model.get_outputs_for_camera(camera)
+    alpha, color = drawn["overlay_alpha"], drawn["overlay_rgb"]
+    assert {name: tuple(drawn[name].shape) for name in ("rgb", "composite", "overlay_rgb", "overlay_alpha")} == {
+        "rgb": (48, 64, 3),
+        "composite": (48, 64, 3),
+        "overlay_rgb": (48, 64, 3),
+        "overlay_alpha": (48, 64, 1),
+    }
+    torch.testing.assert_close(drawn["composite"], alpha * color + (1 - alpha) * drawn["rgb"], atol=1e-5, rtol=0)
+    bottom = (slice(40, None), slice(None))
+    photos = torch.stack([view["image"].float() / 255 for view in pipeline.datamanager.cached_train])
+    assert (drawn["composite"][bottom] - photos.mean(dim=0)[bottom]).abs().mean() < 0.1
+    assert (drawn["rgb"][bottom] - photos.mean(dim=0)[bottom]).abs().mean() > 0.1
+
+
+def test_without_an_overlay_there_is_none_of_it(trained):
+    outcome, pipeline, _ = trained["off"]
+    assert "overlay" not in pipeline.get_param_groups()
+    assert not [name for name, _ in pipeline.model.named_parameters() if "overlay" in name]
+    assert "composite_psnr" not in outcome.metrics
+
+
+def test_a_given_overlay_is_buffers_and_does_not_learn(trained):
+    _, pipeline, _ = trained["given"]
+    layers = Dashboard().layers(48, 64, np.random.default_rng(0))
+    assert "overlay" not in pipeline.get_param_groups()
+    np.testing.assert_array_equal(pipeline.model.overlays[0].transmittance.numpy(), layers.transmittance)
+    np.testing.assert_array_equal(pipeline.model.overlays[0].addition.numpy(), layers.addition)
+
+
+@pytest.mark.parametrize("kind", ["off", "on", "given"])
+def test_a_checkpoint_reloads_without_opening_a_photo(trained, kind):
+    outcome, pipeline, path = trained[kind]
+    _, reloaded, _, _ = eval_setup(path, test_mode="inference")
+    state, expected = reloaded.model.state_dict(), pipeline.model.state_dict()
+    assert state.keys() == expected.keys()
+    assert all(torch.equal(state[name], expected[name]) for name in expected)
+    assert "cached_train" not in vars(reloaded.datamanager)
+
+
+def test_metrics_are_of_the_clean_render_and_complete(trained):
+    outcome, _, _ = trained["on"]
+    assert {"psnr", "ssim", "flip", "mean_colour_deviation", "composite_psnr"} <= outcome.metrics.keys()
+    # The test views are clean: with the artifact drawn in front they fit worse.
+    assert outcome.metrics["psnr"] > outcome.metrics["composite_psnr"] + 1.0
+    assert "lpips" not in outcome.metrics
+
+
+def test_training_twice_gives_the_same_scene(tiny_scene, tmp_path):
+    (_, a, _), (_, b, _) = (run(tiny_scene, tmp_path / name, 12) for name in "ab")
+    assert all(torch.equal(x, b.model.state_dict()[name]) for name, x in a.model.state_dict().items())
+
+
+@pytest.mark.parametrize("model", [{}, {"overlay": "off"}, {"strategy": "mcmc", "cap_max": 4200}])
+def test_a_resumed_run_finishes_the_run_and_trains_what_it_loaded(tiny_scene, tmp_path, model):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
+    config.max_num_iterations = 10
+    _, first, path = train_and_evaluate(config)
+    resumed = configure("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
+    resumed.load_dir = path.parent / "nerfstudio_models"
+    _, second, resumed_path = train_and_evaluate(resumed)
+    checkpoints = sorted((resumed_path.parent / "nerfstudio_models").glob("step-*.ckpt"))
+    assert [c.name for c in checkpoints] == ["step-000000019.ckpt"]
+    saved = torch.load(checkpoints[0])
+    assert saved["optimizers"]["means"]["state"][0]["step"] == 20
+    means = {name: pipeline.model.means.detach() for name, pipeline in (("first", first), ("second", second))}
+    assert not torch.equal(means["first"][:100], means["second"][:100])
+
+
+def test_a_finished_run_is_not_trained_again(tiny_scene, tmp_path):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 6, {"num_downscales": 0})
+    _, first, path = train_and_evaluate(config)
+    again = configure("ssa-splatfacto", tiny_scene, tmp_path, 6, {"num_downscales": 0})
+    again.load_dir = path.parent / "nerfstudio_models"
+    _, second, _ = train_and_evaluate(again)
+    assert torch.equal(first.model.means, second.model.means)
+
+
+@pytest.mark.parametrize("method", sorted(METHODS))
+@pytest.mark.parametrize("reduction", [0, 2])
+def test_every_method_trains_at_full_and_reduced_resolution(tiny_scene, tmp_path, method, reduction):
+    model = {"num_downscales": reduction, "resolution_schedule": 15_000}
+    outcome, pipeline, _ = train_and_evaluate(configure(method, tiny_scene, tmp_path, 12, model))
+    assert np.isfinite(outcome.metrics["psnr"])
+    assert all(torch.isfinite(p).all() for p in pipeline.model.parameters())
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"overlay_downscale": 2, "num_downscales": 1},
+        {"overlay_downscale": 4},
+        {"overlay_start": "constant", "sparsity": "l1"},
+        {"sparsity": "off"},
+        {"use_bilateral_grid": True},
+        {"background_color": "white", "rasterize_mode": "antialiased"},
+        {"sh_degree": 0},
+        {"random_init": True, "num_random": 500},
+        {"use_scale_regularization": True, "output_depth_during_training": True},
+        {"rasterizer": "reference", "use_absgrad": False},
+    ],
+    ids=lambda model: "-".join(model),
+)
+def test_settings_can_be_combined(tiny_scene, tmp_path, model):
+    outcome, pipeline, _ = train_and_evaluate(configure("ssa-splatfacto", tiny_scene, tmp_path, 4, model))
+    assert np.isfinite(outcome.metrics["psnr"])
+    size = -(-48 // model.get("overlay_downscale", 1)), -(-64 // model.get("overlay_downscale", 1))
+    assert pipeline.model.overlays[0].matte().shape[:2] == size
+
+
+def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path):
+    _, pipeline, _ = run(tiny_scene, tmp_path, 1)
+    photos = pipeline.datamanager.cached_train
+    deviation = accumulate((photo["image"], None) for photo in photos).deviation()
+    expected = torch.exp(-deviation / 0.05).clamp(0.01, 0.99).float()
+    # One step of Adam moves every logit by 0.005.
+    drift = pipeline.model.overlays[0].alpha_logits.detach() - expected.logit()
+    assert drift.abs().max() < 0.0051
+
+
+def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path):
+    from PIL import Image
+
+    frames = json.loads((broken_scene / "transforms.json").read_text())["frames"]
+    mask = np.full((48, 64), 255, np.uint8)
+    mask[:10, :10] = 0
+    Image.fromarray(mask).save(broken_scene / "mask.png")
+    edit_transforms(broken_scene, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
+    _, pipeline, _ = run(broken_scene, tmp_path, 3)
+    matte = pipeline.model.overlays[0].matte().detach()
+    assert matte[:10, :10].max() < 0.02
+
+
+def test_a_rig_gets_an_overlay_for_each_of_its_cameras(broken_scene, tmp_path):
+    transforms = json.loads((broken_scene / "transforms.json").read_text())
+    shared = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    for number, frame in enumerate(transforms["frames"]):
+        frame.update({name: transforms[name] for name in shared})
+        frame["cx"] += 1.5 * (number % 2)
+    path = broken_scene / "transforms.json"
+    path.write_text(json.dumps({k: v for k, v in transforms.items() if k not in shared}))
+    _, pipeline, config = run(broken_scene, tmp_path, 4)
+    model = pipeline.model
+    assert len(model.overlays) == 2
+    assert model.camera_keys[:, 4].tolist() == sorted(model.camera_keys[:, 4].tolist())
+    assert set(model._group_of_view) == {0, 1}
+    assert not torch.equal(model.overlays[0].alpha_logits, model.overlays[1].alpha_logits)
+    _, reloaded, _, _ = eval_setup(config, test_mode="inference")
+    assert len(reloaded.model.overlays) == 2
+
+
+def test_a_free_viewpoint_of_any_aspect_shows_the_overlay_unstretched(trained):
+    _, pipeline, _ = trained["on"]
+    pipeline.eval()
+    camera = copy.deepcopy(pipeline.datamanager.eval_dataset.cameras[0:1])
+    camera.width[:], camera.height[:] = 200, 48
+    drawn = pipeline.model.get_outputs_for_camera(camera)
+    assert drawn["overlay_alpha"].shape == (48, 200, 1)
+    assert drawn["overlay_alpha"][:, :68].max() == 0
+    assert drawn["overlay_alpha"][-4:, 70:130].mean() > 0.9
+
+
+def test_every_schedule_is_scaled_with_the_length_of_the_run():
+    config = copy.deepcopy(METHODS["ssa-splatfacto-mcmc"])
+    config.max_num_iterations = 7_000
+    short = scaled(config)
+    model, full = short.pipeline.model, config.pipeline.model
+    assert (model.warmup_length, model.refine_every, model.resolution_schedule) == (117, 23, 700)
+    assert (model.stop_split_at, model.mcmc_stop_at, model.sh_degree_interval) == (3500, 5833, 233)
+    assert model.stop_screen_size_at == 933
+    assert short.optimizers["means"]["scheduler"].max_steps == 7_000
+    assert short.optimizers["camera_opt"]["scheduler"].warmup_steps == 233
+    assert (full.warmup_length, config.optimizers["means"]["scheduler"].max_steps) == (500, 30_000)
+
+
+def test_every_optimiser_is_scale_free():
+    for config in METHODS.values():
+        assert all(entry["optimizer"].eps == 1e-15 for entry in config.optimizers.values())
+
+
+def test_the_papers_protocol_is_what_the_paper_says():
+    config = METHODS["ssa-splatfacto-paper"]
+    model = config.pipeline.model
+    assert config.max_num_iterations == 30_000
+    assert (model.sparsity, model.sparsity_weight, model.ssim_lambda) == ("l1", 0.05, 0.2)
+    assert (model.background_color, model.num_downscales, model.use_absgrad) == ("black", 0, False)
+    assert (model.densify_grad_thresh, model.cull_alpha_thresh) == (2e-4, 0.005)
+    assert config.optimizers["overlay"]["optimizer"].lr == 5e-3
+    assert config.optimizers["overlay"]["scheduler"] is None
+
+
+def test_the_papers_protocol_scales_the_means_by_the_cameras_extent(tiny_scene, tmp_path):
+    config = configure("ssa-splatfacto-paper", tiny_scene, tmp_path, 2)
+    _, pipeline, _ = train_and_evaluate(config)
+    positions = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
+    extent = 1.1 * (positions - positions.mean(dim=0)).norm(dim=1).max()
+    assert pipeline.model.scene_scale == pytest.approx(float(extent), rel=1e-5)
+    assert pipeline.model.strategy_state["scene_scale"] == pipeline.model.scene_scale
+
+
+def test_the_model_is_a_splatfacto_so_that_every_tool_accepts_it(trained):
+    assert isinstance(trained["on"][1].model, SplatfactoModel)
