@@ -7,6 +7,9 @@ from numba import njit
 
 from ssa_nerfstudio.threads import on_all_threads
 
+FAST = {"reassoc", "contract", "arcp", "nsz"}
+"""What vectorising needs of LLVM's fast-math, but not its promise that no value is NaN: the loss has to show one."""
+
 
 def value_and_gradient(
     prediction: np.ndarray, target: np.ndarray, ssim_weight: float, window: np.ndarray
@@ -29,13 +32,11 @@ def value_and_gradient(
     l1_scale = (1.0 - ssim_weight) / prediction.size
     ssim_scale = ssim_weight / (channels * rows * columns)
     on_all_threads(_similarity_rows, prediction, target, window, slopes, similarity)
-    on_all_threads(
-        _gradient_rows, prediction, target, window, slopes, l1_scale, -ssim_scale, gradient, difference
-    )
+    on_all_threads(_gradient_rows, prediction, target, window, slopes, l1_scale, -ssim_scale, gradient, difference)
     return ssim_weight - ssim_scale * float(similarity.sum()) + l1_scale * float(difference.sum()), gradient
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _similarity_rows(thread, threads, x, y, window, slopes, similarity):
     """Fill slopes with dS/d(mean x), dS/dE[x^2 + y^2], dS/dE[xy], and similarity with S summed along rows."""
     channels, rows, columns = similarity.shape[0], similarity.shape[1], slopes.shape[3]
@@ -82,7 +83,7 @@ def _similarity_rows(thread, threads, x, y, window, slopes, similarity):
             similarity[c, row] = total
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath=FAST)
 def _gradient_rows(thread, threads, x, y, window, slopes, l1_scale, ssim_scale, gradient, difference):
     """Spread the slopes back over each window (the transposed blur) and add the L1 term; difference sums |x - y|."""
     channels, height, width = x.shape
