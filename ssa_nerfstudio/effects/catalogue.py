@@ -11,7 +11,14 @@ from ssa_nerfstudio.effects.layers import Layers, VaryingLayers
 
 EFFECTS = {
     "watermark": "Watermark",
+    "ui": "UI",
     "dashboard": "Dashboard",
+    "rain": "Rain",
+    "mud": "Mud",
+    "finger": "Finger",
+    "occlusion": "Occlusion",
+    "vignette": "Vignette",
+    "dust": "Dust",
 }
 """Name of each effect, which is also its module's, and its class."""
 

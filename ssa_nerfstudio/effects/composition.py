@@ -89,6 +89,8 @@ def _bounding_box(boxes: list[Box]) -> Box:
 
 def _pasted(layers: Layers, box: Box, frame: Box) -> Layers:
     """Layers of `box` on clear ground of a rectangle `frame` around it."""
+    if box == frame:
+        return layers
     shape = (frame[0].stop - frame[0].start, frame[1].stop - frame[1].start, 3)
     transmittance, addition = np.ones(shape, np.float32), np.zeros(shape, np.float32)
     rows, columns = (slice(b.start - f.start, b.stop - f.start) for b, f in zip(box, frame, strict=True))

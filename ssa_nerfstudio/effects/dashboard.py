@@ -86,9 +86,7 @@ class Dashboard:
         painter.paint(self.dial_colour, np.abs(radius - 1.475) - 0.012, opacity=0.35)
 
         ramp = self.softness / painter.unit
-        matte = np.clip((top - y) / ramp, 0, 1)[..., None]
-        transmittance = np.broadcast_to(1 - matte, (height, width, 3))
-        return Layers(transmittance.astype(np.float32), (matte * painter.colour).astype(np.float32))
+        return Layers.composited(np.clip((top - y) / ramp, 0, 1), painter.colour)
 
     def _paint_gauge(self, painter: _Painter, centre: float, angle: float) -> None:
         """One dial with its rim, ticks and a needle turned by `angle` radians from upright."""

@@ -45,8 +45,8 @@ class Layers:
             matte: A, [H, W] in [0, 1].
             colour: W, [3] or [H, W, 3] in [0, 1].
         """
-        alpha = np.repeat(matte[..., None], 3, axis=2)
-        return cls((1 - alpha).astype(np.float32), (alpha * colour).astype(np.float32))
+        alpha = np.repeat(matte.astype(np.float32)[..., None], 3, axis=2)
+        return cls(1 - alpha, alpha * np.asarray(colour, np.float32))
 
     @classmethod
     def dimming(cls, transmittance: np.ndarray) -> Layers:

@@ -47,10 +47,7 @@ class Watermark:
         Returns:
             T = 1 - A and B = A colour, with A = alpha times the mark's coverage of the pixel.
         """
-        matte = self.alpha * self._coverage(height, width)[..., None]
-        transmittance = np.broadcast_to(1 - matte, (height, width, 3))
-        addition = matte * np.array(self.colour, dtype=np.float64) / 255
-        return Layers(transmittance.astype(np.float32), addition.astype(np.float32))
+        return Layers.composited(self.alpha * self._coverage(height, width), np.array(self.colour) / 255)
 
     def _coverage(self, height: int, width: int) -> np.ndarray:
         """Share of each pixel under the mark, [height, width] in [0, 1]."""

@@ -7,6 +7,9 @@ import importlib.metadata
 import platform
 from typing import Any
 
+import cv2
+import numpy as np
+import PIL
 import yaml
 
 from ssa_nerfstudio import __version__
@@ -43,9 +46,15 @@ def scene_record(dataset: Dataset, scene: Scene) -> str:
         scene: what was put in front.
     """
     train, val, test = dataset.split
-    libraries = ["numpy", "opencv-python-headless", "Pillow"]
+    versions = {
+        "python": platform.python_version(),
+        "ssa-nerfstudio": __version__,
+        "numpy": np.__version__,
+        "opencv": cv2.__version__,
+        "Pillow": PIL.__version__,
+    }
     if any(name in ("rain", "mud") for name, _ in scene.effects):
-        libraries.append("albumentations")
+        versions["albumentations"] = importlib.metadata.version("albumentations")
     record = {
         "effects": scene.describe(),
         "seed": scene.seed,
@@ -56,11 +65,7 @@ def scene_record(dataset: Dataset, scene: Scene) -> str:
             "views": {"train": len(train), "val": len(val), "test": len(test)},
             "formation": "I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits; several effects are composed "
             "in order, T = T2 T1 and B = T2 B1 + B2, and clipped once",
-            "versions": {
-                "python": platform.python_version(),
-                "ssa-nerfstudio": __version__,
-                **{library: importlib.metadata.version(library) for library in libraries},
-            },
+            "versions": versions,
         },
     }
     return yaml.safe_dump(record, sort_keys=False, allow_unicode=True, width=120)
