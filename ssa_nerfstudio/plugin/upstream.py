@@ -117,7 +117,7 @@ def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor)
     """
     o = opacities.flatten().to(torch.float64)
     n = ratios.clamp(1, binoms.shape[0])
-    new = 1.0 - (1.0 - o) ** (1.0 / n)
+    new = 1.0 - (1.0 - o) ** (1.0 / n.to(torch.float64))
     k = torch.arange(int(n.max()) if n.numel() else 1, device=o.device)
     terms = (-1.0) ** k * new[:, None] ** (k + 1) / (k + 1.0).sqrt()  # [N, n_max]
     # sum_{i=k+1..n} C(i-1, k) = C(n, k+1)

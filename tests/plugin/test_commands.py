@@ -1,0 +1,149 @@
+"""Every nerfstudio command, as its own process, on this machine, offline."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from plyfile import PlyData
+
+import ssa_nerfstudio.plugin.methods  # noqa: F401 - lets torch.load read the checkpoints, as in every command
+
+BIN = Path(sys.executable).parent
+TRAIN = ("--vis", "tensorboard", "--pipeline.model.num-downscales", "0")
+OFFLINE = {**os.environ, "HF_HUB_OFFLINE": "1", "http_proxy": "http://127.0.0.1:9", "https_proxy": "http://127.0.0.1:9"}
+"""No download can succeed: the proxy is a port on which nothing listens."""
+
+
+def command(name: str, *options: str | Path) -> subprocess.CompletedProcess:
+    done = subprocess.run([BIN / name, *options], capture_output=True, text=True, timeout=300, env=OFFLINE)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    return done
+
+
+@pytest.fixture(scope="module")
+def config(tiny_scene, tmp_path_factory) -> Path:
+    """A run that was killed with SIGKILL after its first checkpoints and then resumed to its end."""
+    output = tmp_path_factory.mktemp("runs")
+    options = ["--data", tiny_scene, "--output-dir", output, "--max-num-iterations", "400", "--steps-per-save", "20"]
+    process = subprocess.Popen(
+        [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "killed"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env=OFFLINE,
+    )
+    checkpoints = output / "dashboard" / "ssa-splatfacto" / "killed" / "nerfstudio_models"
+    deadline = time.monotonic() + 240
+    while not list(checkpoints.glob("step-*.ckpt")):
+        assert process.poll() is None, "the training ended before it wrote a checkpoint"
+        assert time.monotonic() < deadline, "no checkpoint was written"
+        time.sleep(0.05)
+    time.sleep(0.5)  # so that the checkpoint that was seen is whole
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    saved = max(int(path.stem.removeprefix("step-")) for path in checkpoints.glob("step-*.ckpt"))
+    assert saved < 399
+    command(
+        "ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "resumed", "--load-dir", checkpoints
+    )
+    return checkpoints.parent.parent / "resumed" / "config.yml"
+
+
+def checkpoint(config: Path) -> dict:
+    return torch.load(max((config.parent / "nerfstudio_models").glob("step-*.ckpt")))
+
+
+def test_a_killed_run_resumes_to_the_step_that_was_asked_for(config):
+    assert checkpoint(config)["step"] == 399
+
+
+def test_eval_writes_the_metrics_of_the_clean_render(config, tmp_path):
+    command("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
+    results = json.loads((tmp_path / "eval.json").read_text())["results"]
+    assert {"psnr", "ssim", "flip", "mean_colour_deviation", "composite_psnr"} <= results.keys()
+    assert results["psnr"] > results["composite_psnr"]
+
+
+def test_render_dataset_writes_every_layer(config, tmp_path):
+    names = ("rgb", "composite", "overlay_rgb", "overlay_alpha")
+    command("ns-render", "dataset", "--load-config", config, "--output-path", tmp_path, "--rendered-output-names", *names)
+    pictures = {name: np.asarray(Image.open(next((tmp_path / "test" / name).iterdir()))) for name in names}
+    assert all(picture.shape[:2] == (48, 64) for picture in pictures.values())
+    # ns-render draws one channel in the colour map "turbo": 1 is red, 0 is blue.
+    red, _, blue = np.moveaxis(pictures["overlay_alpha"].astype(int), -1, 0)
+    assert (red > blue)[40:].mean() > 0.95
+    assert (red < blue)[:20].mean() > 0.95
+    assert np.abs(pictures["rgb"][40:].astype(int) - pictures["composite"][40:]).mean() > 10
+
+
+def test_render_interpolate_writes_images(config, tmp_path):
+    command(
+        "ns-render", "interpolate", "--load-config", config, "--output-path", tmp_path / "frames",
+        "--output-format", "images", "--interpolation-steps", "2",
+    )  # fmt: skip
+    assert len(list((tmp_path / "frames").glob("*.jpg"))) >= 3
+
+
+def test_the_exported_splats_are_the_checkpoints_and_nothing_of_the_overlay(config, tmp_path):
+    command("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path)
+    vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
+    state = {k.removeprefix("_model.gauss_params."): v for k, v in checkpoint(config)["pipeline"].items()}
+    columns = torch.cat([state[n].flatten(1) for n in ("means", "scales", "quats", "opacities", "features_dc")], dim=1)
+    kept = torch.isfinite(columns).all(dim=1) & (torch.sigmoid(state["opacities"][:, 0]) >= 1 / 255)
+    assert len(vertex) == int(kept.sum())
+    for names, values in (
+        (("x", "y", "z"), state["means"]),
+        (("f_dc_0", "f_dc_1", "f_dc_2"), state["features_dc"]),
+        (("opacity",), state["opacities"]),
+        (("scale_0", "scale_1", "scale_2"), state["scales"]),
+        (("rot_0", "rot_1", "rot_2", "rot_3"), state["quats"]),
+    ):
+        exported = np.stack([vertex[name] for name in names], axis=1)
+        np.testing.assert_allclose(exported, values[kept].numpy(), rtol=1e-6)
+    assert not [p.name for p in vertex.properties if "overlay" in p.name or "alpha" in p.name]
+
+
+def test_the_viewer_serves_a_trained_model(config):
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    viewer = subprocess.Popen(
+        [BIN / "ns-viewer", "--load-config", config, "--viewer.websocket-port", str(port)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env=OFFLINE,
+    )
+    try:
+        deadline = time.monotonic() + 200
+        page = ""
+        while "viser" not in page.lower():
+            assert viewer.poll() is None, viewer.stdout.read()[-3000:] if viewer.stdout else ""
+            assert time.monotonic() < deadline, "the viewer's page did not come up"
+            time.sleep(0.5)
+            try:
+                page = urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=5).read().decode(errors="replace")
+            except OSError:
+                continue
+        time.sleep(2)
+        assert viewer.poll() is None
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def test_help_lists_the_three_methods():
+    # tyro prints help and ends with 0; one listing shows that the entry points are installed.
+    text = command("ns-train", "-h").stdout
+    assert all(name in text for name in ("ssa-splatfacto ", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"))

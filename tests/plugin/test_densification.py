@@ -1,0 +1,153 @@
+"""ADC and MCMC: the same sums as gsplat's, on any device, and the equations of the papers."""
+
+from __future__ import annotations
+
+import math
+
+import gsplat.strategy.ops as ops
+import numpy as np
+import pytest
+import torch
+from gsplat.strategy import DefaultStrategy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
+from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.upstream import relocated
+
+WIDTH, HEIGHT = 40, 30
+
+
+def gaussians(n: int, seed: int = 0) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Optimizer]]:
+    generator = torch.Generator().manual_seed(seed)
+    shapes = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "features_dc": (n, 3), "opacities": (n, 1)}
+    params = torch.nn.ParameterDict(
+        {name: torch.nn.Parameter(0.5 * torch.randn(shape, generator=generator)) for name, shape in shapes.items()}
+    )
+    params["scales"].data -= 4
+    optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in params.items()}
+    for name, p in params.items():
+        p.grad = torch.ones_like(p)
+        optimizers[name].step()
+    return params, optimizers
+
+
+def rendered(n: int, seed: int, absgrad: bool) -> dict:
+    """What a rasterizer reports after a backward pass, for one camera that sees some of the Gaussians."""
+    generator = torch.Generator().manual_seed(seed)
+    means2d = torch.zeros(1, n, 2, requires_grad=True)
+    gradient = torch.randn(1, n, 2, generator=generator) * 1e-4
+    if absgrad:
+        means2d.absgrad = gradient.abs()  # pyright: ignore[reportAttributeAccessIssue]
+    else:
+        means2d.grad = gradient
+    radii = torch.randint(0, 20, (1, n), generator=generator, dtype=torch.int32)
+    radii[:, ::3] = 0
+    sizes = {"width": WIDTH, "height": HEIGHT, "n_cameras": 1}
+    return {**sizes, "radii": radii, "gaussian_ids": None, "means2d": means2d}
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+def test_the_statistics_are_gsplats(absgrad):
+    options = {"absgrad": absgrad, "refine_scale2d_stop_iter": 4000}
+    ours, theirs = AdaptiveDensityControl(**options), DefaultStrategy(**options)
+    states = [strategy.initialize_state() for strategy in (ours, theirs)]
+    params, _ = gaussians(50)
+    for seed in range(4):
+        for strategy, state in zip((ours, theirs), states, strict=True):
+            strategy._update_state(params, state, rendered(50, seed, absgrad))
+    for key in ("grad2d", "count", "radii"):
+        torch.testing.assert_close(states[0][key], states[1][key], rtol=1e-6, atol=0)
+
+
+def test_refinement_grows_and_prunes_as_gsplats_does():
+    results = []
+    for kind in (AdaptiveDensityControl, DefaultStrategy):
+        strategy = kind(refine_start_iter=0, refine_every=2, reset_every=1000, grow_grad2d=1e-3)
+        params, optimizers = gaussians(80)
+        state = strategy.initialize_state()
+        torch.manual_seed(1)
+        for step in (1, 2):
+            strategy.step_post_backward(params, optimizers, state, step, rendered(80, step, False))
+        results.append(params)
+    assert len(results[0]["means"]) > 80
+    assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+
+
+def test_opacities_are_not_reset_before_the_first_step():
+    params, optimizers = gaussians(20)
+    before = params["opacities"].detach().clone()
+    strategy = AdaptiveDensityControl(reset_every=10)
+    state = strategy.initialize_state()
+    strategy.step_post_backward(params, optimizers, state, 0, rendered(20, 0, False))
+    assert torch.equal(params["opacities"], before)
+    strategy.step_post_backward(params, optimizers, state, 10, rendered(20, 0, False))
+    assert torch.sigmoid(params["opacities"]).max() <= 2 * strategy.prune_opa + 1e-6
+
+
+def equation_nine(o: float, s: float, n: int) -> tuple[float, float]:
+    """3DGS as MCMC, equation 9, with Python's exact binomials and double precision, term by term."""
+    new = 1 - (1 - o) ** (1 / n)
+    total = sum(
+        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1) for i in range(1, n + 1) for k in range(i)
+    )
+    return new, o / total * s
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.floats(0.01, 0.99), st.floats(1e-3, 10), st.integers(1, 20))
+def test_relocation_is_equation_nine(o, s, n):
+    binoms = MarkovChainMonteCarlo().initialize_state()["binoms"]
+    opacity, scale = torch.tensor([o], dtype=torch.float64), torch.full((1, 3), s, dtype=torch.float64)
+    new_opacity, new_scale = relocated(opacity, scale, torch.tensor([n]), binoms)
+    expected_opacity, expected_scale = equation_nine(o, s, n)
+    np.testing.assert_allclose(new_opacity.numpy(), expected_opacity, rtol=1e-9)
+    np.testing.assert_allclose(new_scale.numpy(), expected_scale, rtol=1e-6)
+
+
+@pytest.mark.parametrize("n", [1, 2, 51, 400])
+def test_relocation_keeps_the_opacity_of_the_whole_and_shrinks(n):
+    binoms = MarkovChainMonteCarlo().initialize_state()["binoms"]
+    opacities, scales = torch.linspace(0.02, 0.98, 25)[:, None], torch.ones(25, 3)
+    new, sizes = relocated(opacities, scales, torch.full((25,), n), binoms)
+    copies = min(n, 51)
+    torch.testing.assert_close(1 - (1 - new) ** copies, opacities, rtol=1e-4, atol=1e-5)
+    assert new.shape == opacities.shape
+    assert torch.isfinite(sizes).all()
+    assert (sizes <= 1.0 + 1e-5).all()
+    assert (sizes > 0).all()
+
+
+def test_mcmc_moves_the_dead_adds_up_to_its_cap_and_perturbs():
+    params, optimizers = gaussians(60)
+    params["opacities"].data[:20] = -9.0
+    strategy = MarkovChainMonteCarlo(refine_start_iter=0, refine_every=1, cap_max=62)
+    state = strategy.initialize_state(scene_scale=1.0)
+    before = params["means"].detach().clone()
+    strategy.step_post_backward(params, optimizers, state, 1, {})
+    assert len(params["means"]) == 62
+    assert (torch.sigmoid(params["opacities"]) > strategy.min_opacity).all()
+    assert not torch.equal(params["means"][20:60], before[20:])
+    assert all(torch.isfinite(p).all() for p in params.values())
+    assert all(optimizers[name].state[params[name]]["exp_avg"].shape == params[name].shape for name in params)
+
+
+def test_the_noise_follows_the_learning_rate_of_the_means():
+    moved = []
+    for lr in (0.0, 1e-3):
+        params, optimizers = gaussians(30)
+        params["opacities"].data[:] = -6.0
+        optimizers["means"].param_groups[0]["lr"] = lr
+        before = params["means"].detach().clone()
+        strategy = MarkovChainMonteCarlo(refine_start_iter=100)
+        strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {})
+        moved.append((params["means"] - before).abs().max().item())
+    assert moved[0] == 0
+    assert moved[1] > 0
+
+
+def test_covariances_on_a_cpu_are_rotated_squared_scales():
+    quats, scales = torch.tensor([[math.sqrt(0.5), 0, 0, math.sqrt(0.5)]]), torch.tensor([[1.0, 2.0, 3.0]])
+    covars, _ = ops.quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    torch.testing.assert_close(covars[0], torch.diag(torch.tensor([4.0, 1.0, 9.0])), atol=1e-5, rtol=0)
