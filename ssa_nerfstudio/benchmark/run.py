@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 import random
 import time
 from collections.abc import Callable
@@ -13,6 +14,8 @@ from typing import Any
 
 import numpy as np
 import torch
+import tyro
+import yaml
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -134,3 +137,40 @@ def versions() -> dict[str, str]:
     found = {name: version(name) for name in ("torch", "gsplat", "nerfstudio")}
     found["device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
     return found
+
+
+@dataclass
+class Command:
+    """One training, its figures written as JSON: `python -m ssa_nerfstudio.benchmark.run --data DIR --output FILE`."""
+
+    data: Path
+    """A nerfstudio dataset."""
+    output: Path
+    """The JSON file to write; the trained model goes into a folder beside it."""
+    method: str = "ssa-splatfacto"
+    """ssa-splatfacto, ssa-splatfacto-mcmc or ssa-splatfacto-paper."""
+    steps: int = 30_000
+    """Training steps; every schedule is scaled to them."""
+    settings: tuple[str, ...] = ()
+    """Settings of the model as name=value, for example overlay=off sparsity_weight=0.01."""
+    scale_factor: float = 1.0
+    """Photos are resized by this."""
+
+    def run(self) -> None:
+        """Train, evaluate, write."""
+        model = {name: yaml.safe_load(value) for name, value in (s.split("=", 1) for s in self.settings)}
+        # YAML reads on and off as booleans.
+        if isinstance(model.get("overlay"), bool):
+            model["overlay"] = "on" if model["overlay"] else "off"
+        if "overlay_given" in model:
+            model["overlay_given"] = Path(model["overlay_given"])
+        folder = self.output.with_suffix("")
+        config = configure(self.method, self.data, folder, self.steps, model, self.scale_factor)
+        outcome, _, path = train_and_evaluate(config)
+        asked = {"method": self.method, "data": self.data.name, "steps": self.steps, "settings": list(self.settings)}
+        self.output.parent.mkdir(parents=True, exist_ok=True)
+        self.output.write_text(json.dumps({**asked, **outcome.as_dict(), "config": str(path)}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    tyro.cli(Command).run()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
-from nerfstudio.engine.trainer import Trainer, TrainerConfig
+from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
@@ -58,6 +58,11 @@ class SSATrainer(Trainer):
     def _load_checkpoint(self) -> None:
         check_checkpoint(self.config.load_dir, self.config.load_step, self.config.load_checkpoint)
         super()._load_checkpoint()
+
+    def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
+        """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""
+        loss, losses, metrics = super().train_iteration(step)
+        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:
         """Train up to max_num_iterations steps in all; upstream's resumed runs train that many more."""
