@@ -1,0 +1,45 @@
+"""The speed that the cpu rasterizer owes its existence to."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+from rasterization_scenes import BODIES, Scene, scene
+
+from ssa_nerfstudio.benchmark.rasterizers import draw
+from ssa_nerfstudio.rasterization.projection import project
+
+
+def floor(made: Scene, width: int, height: int) -> None:
+    """Projection, harmonics and autograd in torch, without blending: less than this no torch rasterizer takes."""
+    leaves = [value.clone().requires_grad_() for value in made[0].values()]
+    means, quats, scales, opacities, colors = leaves
+    splats = project(
+        means, quats, scales, opacities, colors, made[1][0], made[2][0], width, height,
+        near_plane=0.01, far_plane=1e10, radius_clip=0.0, eps2d=0.3, sh_degree=3, antialiased=False,
+    )  # fmt: skip
+    (splats.means2d.sum() + splats.conics.sum() + splats.opacities.sum() + splats.colors.sum()).backward()
+
+
+def seconds(work, *arguments) -> float:
+    start = time.perf_counter()
+    work(*arguments)
+    return time.perf_counter() - start
+
+
+def test_forward_and_backward_take_at_most_2_2_floors_and_a_tenth_of_the_reference() -> None:
+    size = 256
+    made = scene(10_000, size, size, size=0.012, dtype=torch.float32)
+    draw(BODIES["cpu"], *made, size, size)  # compiles
+    runs = {"floor": [seconds(floor, made, size, size)], "cpu": [], "reference": []}
+    best = {}
+    for _ in range(3):  # machines are noisy: minima of interleaved runs, over more and more of them
+        for _ in range(6):
+            runs["floor"].append(seconds(floor, made, size, size))
+            runs["cpu"].append(seconds(draw, BODIES["cpu"], *made, size, size))
+        runs["reference"].append(seconds(draw, BODIES["reference"], *made, size, size))
+        best = {name: min(values) for name, values in runs.items()}
+        if best["cpu"] <= 2.2 * best["floor"] and 10 * best["cpu"] <= best["reference"]:
+            return
+    raise AssertionError(f"{best} seconds")
