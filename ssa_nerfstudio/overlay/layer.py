@@ -1,4 +1,7 @@
-"""The artifact as a picture in front of every view: parameters, matte, compositing (paper, section "Modeling screen-space artifacts")."""
+"""The artifact as a picture in front of every view: parameters, matte, compositing.
+
+Source: the paper, section "Modeling screen-space artifacts".
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,6 @@ from ssa_nerfstudio.overlay.resampling import (
     letterbox,
     reduced_size,
     stack_premultiplied,
-    straight_color,
     to_training_scale,
 )
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
@@ -38,6 +40,9 @@ def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
 class ScreenSpaceOverlay(nn.Module):
     """A learnable RGBA image shared by all views of one camera: W = sigmoid(W~), A = sigmoid(A~), one per pixel."""
 
+    frame: Tensor
+    evidence: Tensor
+
     def __init__(self, height: int, width: int, resolution: int = 1) -> None:
         """Make an overlay for a frame, with the paper's constant start.
 
@@ -65,9 +70,10 @@ class ScreenSpaceOverlay(nn.Module):
         if statistics.size != (self.height, self.width):
             raise ValueError(f"statistics of a frame {statistics.size} for an overlay of {(self.height, self.width)}")
         mean, deviation = statistics.mean(), statistics.deviation()
+        # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the
+        # pixel, is 1, and its mean colour would be lost.
         alpha = torch.exp(-deviation / STATISTICS_SCALE)
-        transmittance, addition = stack_premultiplied(mean, alpha)
-        pair = torch.cat([transmittance, addition, deviation], dim=-1).to(self.alpha_logits)
+        pair = torch.cat([alpha, alpha * mean, deviation], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
             padded = nn.functional.pad(
@@ -76,8 +82,8 @@ class ScreenSpaceOverlay(nn.Module):
                 mode="replicate",
             )
             pair = nn.functional.avg_pool2d(padded, self.resolution)[0].permute(1, 2, 0)
-        color, alpha = straight_color(pair[..., :1], pair[..., 1:4])
-        self.color_logits.copy_(color.clamp(*COLOR_START_RANGE).logit())
+        alpha = pair[..., :1]
+        self.color_logits.copy_((pair[..., 1:4] / alpha).clamp(*COLOR_START_RANGE).logit())
         self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
         self.evidence.copy_(_evidence(pair[..., 4:]))
 
@@ -105,6 +111,10 @@ class ScreenSpaceOverlay(nn.Module):
 
 class GivenOverlay(nn.Module):
     """The true artifact, known and not learned: I = clip(T C + B), T per channel. The reference of every benchmark."""
+
+    frame: Tensor
+    transmittance: Tensor
+    addition: Tensor
 
     def __init__(self, transmittance: Tensor, addition: Tensor) -> None:
         """Take T and B [H, W, 3] of the undistorted frame.
@@ -145,4 +155,3 @@ def _evidence(deviation: Tensor) -> Tensor:
     rank = max(1, round(0.7 * values.numel()))
     reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
     return torch.ones_like(deviation) if reference <= 0 else (deviation / reference).clamp_max(1.0)
-
