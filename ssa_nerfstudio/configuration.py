@@ -151,11 +151,21 @@ def _converted(hint: Any, value: Any, name: str) -> Any:
             return None
     elif isinstance(value, hint) and (hint is bool or not isinstance(value, bool)):
         return value
-    described = hint.__name__ if isinstance(hint, type) and origin is None else str(hint)
-    raise ValueError(f"{name} must be {_PLAIN.get(described, described)}, got {value!r}")
+    raise ValueError(f"{name} must be {_described(hint)}, got {value!r}")
 
 
-_PLAIN = {"float": "a number", "int": "a whole number", "str": "a text", "bool": "true or false"}
+def _described(hint: Any) -> str:
+    plain = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", Path: "a path"}
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(_described, arguments))
+    if origin is tuple and arguments[-1] is not Ellipsis:
+        return f"a list of {len(arguments)} values"
+    if origin in (tuple, list):
+        return "a list"
+    if hint is types.NoneType:
+        return "nothing"
+    return plain.get(hint, "keys and values")
 
 
 def _suggestion(name: object, known: Any) -> str:

@@ -55,6 +55,6 @@ class Command:
         simulate(dataset, scene, self.output, self.threads)
 
         train, _, test = dataset.split
-        console = Console()
-        console.print(f"{self.output}: {len(train)} training photos, {len(test)} clean test photos", highlight=False)
-        console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}", highlight=False)
+        console = Console(highlight=False, soft_wrap=True)
+        console.print(f"{self.output}: {len(train)} training photos, {len(test)} clean test photos")
+        console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}")

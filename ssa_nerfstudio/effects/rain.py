@@ -22,7 +22,7 @@ class Rain:
     """
 
     intensity: float = 0.6
-    """Spatter's `intensity`: brightness that the strongest drop adds, in (0, 1]."""
+    """Spatter's `intensity`, in (0, 1]: the brightest drop adds 0.9 of it."""
     colour: tuple[int, int, int] = (238, 238, 175)
     """Spatter's `color`: of the added light, sRGB, 0..255; its own default, a pale yellow."""
     mean: float = 0.65

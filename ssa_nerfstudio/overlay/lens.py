@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import cv2
@@ -132,6 +133,7 @@ def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
     return cv2.remap(image, places, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
 
 
+@lru_cache(maxsize=256)
 def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
     """The undistorted camera, its K [3, 3] before the crop (OpenCV's convention), and the crop's corner (x, y)."""
     if not lens.distorted:

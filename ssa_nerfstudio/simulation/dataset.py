@@ -76,7 +76,9 @@ class Dataset:
         except (OSError, ValueError) as error:
             raise refuse(f"{path} is no valid JSON ({error}); write it again with ns-process-data") from error
         frames = meta.get("frames") if isinstance(meta, dict) else None
-        if not isinstance(frames, list) or not all(isinstance(f, dict) and "file_path" in f for f in frames):
+        if not isinstance(frames, list) or not all(
+            isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames
+        ):
             raise refuse(f"{path} has no list 'frames' of photos with a file_path; write it again with ns-process-data")
         dataset = cls(path.parent, meta, downscale_factor, eval_interval)
         dataset._check(path)
@@ -141,6 +143,8 @@ class Dataset:
     def _known(self, split: str, paths: list[str]) -> list[str]:
         """The frames' own spelling of the names in a list of transforms.json."""
         spelling = {Path(path): path for path in paths}
+        if not isinstance(self.meta[split], list) or not all(isinstance(name, str) for name in self.meta[split]):
+            raise refuse(f"{self.root}/transforms.json: {split} must be a list of file paths; mend or remove it")
         for name in self.meta[split]:
             if Path(name) not in spelling:
                 raise refuse(f"{self.root}/transforms.json: {split} has {name}, which no frame is; remove it there")
@@ -153,8 +157,9 @@ class Dataset:
             return float(self.meta[key] if key in self.meta else frame[key])
 
         model = self.meta.get("camera_model", "OPENCV")
-        # nerfstudio takes all of the distortion from one place.
-        source = self.meta if any(key in self.meta for key in (*_DISTORTION, "distortion_params")) else frame
+        # nerfstudio takes all of the distortion from one place, and does not look for k4 to find it.
+        stated = {*_DISTORTION, "distortion_params"} - {"k4"}
+        source = self.meta if stated & self.meta.keys() else frame
         distortion = tuple(source.get("distortion_params") or (source.get(key, 0.0) for key in _DISTORTION))
         if model not in _FISHEYE | _PERSPECTIVE and any(distortion):
             raise ValueError(f"camera_model {model} with distortion is none that splatfacto trains on")
@@ -176,16 +181,16 @@ class Dataset:
                 undistorted(self._lens(frame))
             except (TypeError, ValueError) as error:
                 raise refuse(f"{path}: camera of {frame['file_path']}: {error}; process the photos again") from error
-        paths = [Path(frame["file_path"]) for frame in self.meta["frames"]]
-        for number, photo in enumerate(paths):
-            if photo in paths[:number]:
+        seen = set()
+        for photo in (Path(frame["file_path"]) for frame in self.meta["frames"]):
+            if photo in seen:
                 raise refuse(f"{path} has two frames of {photo}; remove one")
-        roles = [view.role for view in self.views]
-        if "train" not in roles:
-            raise refuse(f"{path} leaves no photo to train on; add photos or hold fewer back for evaluation")
+            seen.add(photo)
         train, val, test = self.split
         for both in sorted({*train} & {*val, *test}):
             raise refuse(f"{path}: {both} is both training and test view; test views stay clean, list it once")
+        if not train:
+            raise refuse(f"{path} leaves no photo to train on; add photos or hold fewer back for evaluation")
         names = [name for view in self.views for name in (view.path, *(name for _, name in view.companions))]
         for name in [*names, *self.points]:
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:

@@ -114,7 +114,7 @@ def _effect(values: Any, where: str) -> tuple[str, Effect]:
     if not isinstance(values, dict) or "effect" not in values:
         raise refuse(f"{where}: key 'effect' is missing; it names one of {', '.join(EFFECTS)}")
     name = values["effect"]
-    if name not in EFFECTS:
+    if not isinstance(name, str) or name not in EFFECTS:
         raise refuse(f"{where}: effect {name!r} is unknown; choose one of {', '.join(EFFECTS)}")
     parameters = {key: value for key, value in values.items() if key != "effect"}
     return name, build(effect_class(name), parameters, where)

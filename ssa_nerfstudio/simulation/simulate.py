@@ -33,14 +33,14 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
     Raises:
         BadInput: the folder exists or cannot be written, or a file of the dataset is missing or cannot be used.
     """
-    corrupted = [view for view in dataset.views if view.role == "train"] if scene.effects else []
-    names = {view.path: view.path for view in dataset.views}
-    names |= {view.path: str(PurePosixPath(view.path).with_suffix(".png")) for view in corrupted}
+    corrupted = [view.path for view in dataset.views if view.role == "train"] if scene.effects else []
+    renamed = {path: str(PurePosixPath(path).with_suffix(".png")) for path in corrupted}
+    names = {view.path: view.path for view in dataset.views} | renamed
     _check_names(names)
     with staged_folder(output) as folder, Progress(transient=True) as progress:
         task = progress.add_task("Simulating", total=len(dataset.views))
         for view in dataset.views:
-            if names[view.path] == view.path and view not in corrupted:
+            if view.path not in renamed:
                 _copy(dataset.source(view.path), folder / view.path)
                 progress.advance(task)
             for kind, path in view.companions:
