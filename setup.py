@@ -1,9 +1,10 @@
 """Ships configs/ as ssa_nerfstudio/configs, which pyproject.toml alone cannot say; all else is there."""
 
-from setuptools import find_packages, setup
+from setuptools import find_namespace_packages, find_packages, setup
 
+configs = ["ssa_nerfstudio.configs", *(f"ssa_nerfstudio.configs.{kind}" for kind in find_namespace_packages("configs"))]
 setup(
-    packages=[*find_packages(include=["ssa_nerfstudio*"]), "ssa_nerfstudio.configs"],
+    packages=[*find_packages(include=["ssa_nerfstudio*"]), *configs],
     package_dir={"ssa_nerfstudio.configs": "configs"},
-    package_data={"ssa_nerfstudio.configs": ["*/*.yaml"]},
+    package_data={name: ["*.yaml"] for name in configs},
 )

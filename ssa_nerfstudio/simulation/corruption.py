@@ -34,7 +34,7 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
         threads: photos worked on at once.
 
     Raises:
-        UnusablePhoto: a photo cannot be read or is not as transforms.json says.
+        UnusableFile: a photo cannot be read or is not as transforms.json says.
     """
     numbered = [(number, view) for number, view in enumerate(dataset.views) if view.role == "train"]
     # In the output's order, which is the one that nerfstudio numbers cameras in.

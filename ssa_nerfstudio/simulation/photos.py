@@ -11,8 +11,8 @@ _COMPRESSION = 1
 """zlib's fastest: level 6 takes three times as long for files 13 % smaller."""
 
 
-class UnusablePhoto(ValueError):
-    """A file that is no photo, or none that the simulator can work with; the message is one line with the remedy."""
+class UnusableFile(ValueError):
+    """A file that is missing or that the simulator cannot work with; the message is one line with the remedy."""
 
 
 def read_photo(path: Path, width: int, height: int) -> np.ndarray:
@@ -26,22 +26,22 @@ def read_photo(path: Path, width: int, height: int) -> np.ndarray:
         uint8 [height, width, 3].
 
     Raises:
-        UnusablePhoto: the file cannot be decoded, or its kind or size is another.
+        UnusableFile: the file cannot be decoded, or its kind or size is another.
     """
     try:
         with Image.open(path) as image:
             image.load()
     except (OSError, SyntaxError, ValueError) as error:
-        raise UnusablePhoto(
+        raise UnusableFile(
             f"{path} cannot be read as a photo ({error}); copy it again from its source or remove its frame"
         ) from error
     if image.size != (width, height):
-        raise UnusablePhoto(
+        raise UnusableFile(
             f"{path} is {image.width} x {image.height}, transforms.json says {width} x {height}; mend w and h there"
         )
     if image.mode not in ("RGB", "L", "RGBA") or (image.mode == "RGBA" and image.getextrema()[3][0] < 255):
         kind = "has transparent pixels" if image.mode == "RGBA" else f"is of mode {image.mode}"
-        raise UnusablePhoto(f"{path} {kind}; convert it to 8-bit RGB")
+        raise UnusableFile(f"{path} {kind}; convert it to 8-bit RGB")
     return np.asarray(image.convert("RGB"))
 
 

@@ -11,7 +11,7 @@ from rich.progress import Progress
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.simulation.corruption import corrupt
 from ssa_nerfstudio.simulation.dataset import Dataset
-from ssa_nerfstudio.simulation.photos import UnusablePhoto
+from ssa_nerfstudio.simulation.photos import UnusableFile
 from ssa_nerfstudio.simulation.record import scene_record, transforms
 from ssa_nerfstudio.simulation.scene import Scene
 from ssa_nerfstudio.simulation.staging import staged_folder
@@ -37,25 +37,25 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
     renamed = {path: str(PurePosixPath(path).with_suffix(".png")) for path in corrupted}
     names = {view.path: view.path for view in dataset.views} | renamed
     _check_names(names)
-    with staged_folder(output) as folder, Progress(transient=True) as progress:
-        task = progress.add_task("Simulating", total=len(dataset.views))
-        for view in dataset.views:
-            if view.path not in renamed:
-                _copy(dataset.source(view.path), folder / view.path)
-                progress.advance(task)
-            for kind, path in view.companions:
-                _copy(dataset.source(path, kind), folder / path)
-        for path in dataset.points:
-            _copy(dataset.root / path, folder / path)
-        if scene.effects:
-            try:
+    try:
+        with staged_folder(output) as folder, Progress(transient=True) as progress:
+            task = progress.add_task("Simulating", total=len(dataset.views))
+            for view in dataset.views:
+                if view.path not in renamed:
+                    _copy(dataset.source(view.path), folder / view.path)
+                    progress.advance(task)
+                for kind, path in view.companions:
+                    _copy(dataset.source(path, kind), folder / path)
+            for path in dataset.points:
+                _copy(dataset.root / path, folder / path)
+            if scene.effects:
                 for _ in corrupt(dataset, scene, names, folder, threads):
                     progress.advance(task)
-            except UnusablePhoto as error:
-                raise refuse(str(error)) from error
-        (folder / "scene.yaml").write_text(scene_record(dataset, scene), encoding="utf-8")
-        # Last, because it is what makes the folder a dataset.
-        (folder / "transforms.json").write_text(json.dumps(transforms(dataset, names), indent=4), encoding="utf-8")
+            (folder / "scene.yaml").write_text(scene_record(dataset, scene), encoding="utf-8")
+            # Last, because it is what makes the folder a dataset.
+            (folder / "transforms.json").write_text(json.dumps(transforms(dataset, names), indent=4), encoding="utf-8")
+    except UnusableFile as error:
+        raise refuse(str(error)) from error
 
 
 def _check_names(names: dict[str, str]) -> None:
@@ -67,6 +67,6 @@ def _check_names(names: dict[str, str]) -> None:
 
 def _copy(source: Path, target: Path) -> None:
     if not source.is_file():
-        raise refuse(f"{source} does not exist; put it there or remove it from transforms.json")
+        raise UnusableFile(f"{source} does not exist; put it there or remove it from transforms.json")
     target.parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(source, target)
