@@ -6,7 +6,7 @@ import sys
 
 
 class BadInput(SystemExit):
-    """Input that cannot be worked with. A `SystemExit` of code 2, so that it ends `ns-*` commands without a traceback."""
+    """Input that cannot be worked with: a `SystemExit` of code 2, which ends `ns-*` commands without a traceback."""
 
     def __init__(self, message: str) -> None:
         """Take the whole message: what is wrong with what, and what to do about it, in one line."""

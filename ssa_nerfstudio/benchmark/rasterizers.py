@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from rich.console import Console
@@ -20,11 +21,14 @@ from ssa_nerfstudio.rasterization import rasterizer, reference
 from ssa_nerfstudio.rasterization.projection import project
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
+"""What a Gaussian consists of, in the order of the rasterizers' arguments."""
+Scene = tuple[dict[str, Tensor], Tensor, Tensor]
+"""Parameters as `rasterization` takes them, viewmats [C, 4, 4], Ks [C, 3, 3]."""
 
 
 def random_scene(
     n: int, width: int, height: int, size: float, dtype: torch.dtype = torch.float32, seed: int = 0
-) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+) -> Scene:
     """Gaussians in a 2 x 2 x 2 cube three units in front of a camera.
 
     Args:
@@ -32,7 +36,7 @@ def random_scene(
         size: their median standard deviation, in world units.
 
     Returns:
-        Parameters as `rasterization` takes them (colours as third-degree spherical harmonics), viewmats, Ks.
+        The scene, with colours as third-degree spherical harmonics.
     """
     generator = torch.Generator().manual_seed(seed)
 
@@ -105,8 +109,7 @@ def compare(n: int, width: int, height: int, size: float) -> Table:
     table.add_column("")
     columns = {}
     for name, (rasterization, device, dtype) in bodies().items():
-        here = [{k: v.to(device, dtype) for k, v in scene[0].items()}, *(t.to(device, dtype) for t in scene[1:])]
-        columns[name] = draw(rasterization, *here, width, height)
+        columns[name] = draw(rasterization, *_moved(scene, device, dtype), width, height)
         table.add_column(name)
     for key in oracle:
         table.add_row(key, *(f"{relative_error(column[key], oracle[key]):.1e}" for column in columns.values()))
@@ -120,24 +123,23 @@ def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10)
     def floor(gaussians: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> None:
         leaves = {name: value.detach().clone().requires_grad_() for name, value in gaussians.items()}
         splats = project(
-            *(leaves[name] for name in PARAMETERS), viewmats[0], Ks[0], width, height,
+            **leaves, viewmat=viewmats[0], K=Ks[0], width=width, height=height,
             near_plane=0.01, far_plane=1e10, radius_clip=0.0, eps2d=0.3, sh_degree=3, antialiased=False,
         )  # fmt: skip
         (splats.means2d.sum() + splats.conics.sum() + splats.opacities.sum() + splats.colors.sum()).backward()
 
-    runs: dict[str, tuple[Callable, list]] = {"floor": (floor, [*scene])}
+    runs: dict[str, Callable] = {"floor": lambda: floor(*scene)}
     for name, (rasterization, device, dtype) in bodies().items():
         if dtype == torch.float32:
-            here = [{k: v.to(device) for k, v in scene[0].items()}, *(t.to(device) for t in scene[1:])]
-            runs[name] = (lambda *a, f=rasterization: draw(f, *a, width, height), here)
-    runs["reference"] = (lambda *a: draw(reference.rasterization, *a, width, height), [*scene])
+            runs[name] = partial(draw, rasterization, *_moved(scene, device, dtype), width, height)
+    runs["reference"] = partial(draw, reference.rasterization, *scene, width, height)
     seconds: dict[str, list[float]] = {name: [] for name in runs}
     for repeat in range(repeats + 2):  # interleaved, so that a busy machine slows all alike; two rounds warm up
-        for name, (run, arguments) in runs.items():
+        for name, run in runs.items():
             if name == "reference" and repeat > 3:
                 continue
             start = time.perf_counter()
-            run(*arguments)
+            run()
             if torch.cuda.is_available():
                 torch.cuda.synchronize()
             seconds[name].append(time.perf_counter() - start)
@@ -148,6 +150,11 @@ def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10)
     for name, median in medians.items():
         table.add_row(name, f"{1e3 * median:.1f}", f"{median / medians['floor']:.2f}")
     return table
+
+
+def _moved(scene: Scene, device: str, dtype: torch.dtype) -> Scene:
+    gaussians, viewmats, Ks = scene
+    return {k: v.to(device, dtype) for k, v in gaussians.items()}, viewmats.to(device, dtype), Ks.to(device, dtype)
 
 
 def main() -> None:

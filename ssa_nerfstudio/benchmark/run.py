@@ -10,12 +10,13 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 import tyro
 import yaml
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -24,9 +25,11 @@ from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, s
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
 
-METHODS = {
-    spec.config.method_name: spec.config for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
+METHODS: dict[str, SSATrainerConfig] = {
+    str(spec.config.method_name): cast(SSATrainerConfig, spec.config)
+    for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
 }
+"""The methods by name."""
 
 
 @dataclass
@@ -52,7 +55,7 @@ class Outcome:
 def configure(
     method: str, data: Path, output: Path, steps: int, model: dict[str, Any] | None = None, scale_factor: float = 1.0
 ) -> SSATrainerConfig:
-    """A method's configuration for an unattended run: no viewer, no evaluation while training, one checkpoint at the end.
+    """A method's configuration for an unattended run: no viewer, no evaluation in between, one checkpoint at the end.
 
     Args:
         method: a key of `METHODS`.
@@ -70,7 +73,7 @@ def configure(
     config.steps_per_eval_image = 0
     datamanager = config.pipeline.datamanager
     datamanager.data, datamanager.camera_res_scale_factor = data, scale_factor
-    datamanager.dataparser.eval_mode, datamanager.dataparser.eval_interval = "interval", 8
+    datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
     for name, value in (model or {}).items():
         if not hasattr(config.pipeline.model, name):
             raise AttributeError(f"the model has no setting {name!r}")
@@ -135,7 +138,9 @@ def train_and_evaluate(
 def versions() -> dict[str, str]:
     """Versions of what a result depends on, and the device."""
     found = {name: version(name) for name in ("torch", "gsplat", "nerfstudio")}
-    found["device"] = torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
+    found["device"] = (
+        torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
+    )
     return found
 
 

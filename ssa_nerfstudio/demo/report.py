@@ -20,7 +20,8 @@ COLUMNS = (("psnr", "PSNR dB", "{:.2f}"), ("ssim", "SSIM", "{:.3f}"), ("flip", "
 """Metric, heading, format; higher is better for the first two."""
 CORRUPTED = (
     "The test photos of this capture carry the artifact too (its transforms.json names no clean test_filenames): "
-    "the figures compare a clean scene with corrupted photos, and a better removal can score lower. Look at the pictures."
+    "the figures compare a clean scene with corrupted photos, and a better removal can score lower. "
+    "Look at the pictures."
 )
 
 

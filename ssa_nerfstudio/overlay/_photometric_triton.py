@@ -1,3 +1,5 @@
+# pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false, reportIndexIssue=false
+# (Triton's kernels are no Python to a type checker.)
 """L1 + SSIM and its gradient on CUDA: four Triton kernels, each bound by memory. See `losses.photometric`.
 
 Images stay [H, W, C]: a shift by one pixel is a shift by C in memory, so that no channel needs to be told apart.

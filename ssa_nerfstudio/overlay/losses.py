@@ -1,4 +1,4 @@
-"""The loss terms: photometric (L1 and SSIM) and sparsity of the matte. Pure functions; every term is a mean over pixels."""
+"""The loss terms: photometric (L1 and SSIM) and sparsity of the matte. Pure functions; all are means over pixels."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from torch import Tensor
 Sparsity = Literal["l1", "log", "off"]
 
 LOG_SOFTNESS = 0.1
-"""e of the concave penalty log(1 + A / e): below this opacity it acts like l1, above it spares what is opaque anyway."""
+"""e of the concave penalty log(1 + A / e): below this opacity it acts like l1, above it spares what is opaque."""
 LOG_EVIDENCE_FLOOR = 0.1
 """Share of the concave penalty that a pixel pays whose colour is the same in all views."""
 SSIM_WINDOW = 11
-"""Side of SSIM's Gaussian window in pixels (sigma 1.5), "valid" padding: as pytorch_msssim and the paper's code base."""
+"""Side of SSIM's Gaussian window in pixels (sigma 1.5); "valid" padding, as pytorch_msssim."""
 
 
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
@@ -106,8 +106,9 @@ class _Photometric(torch.autograd.Function):
         elif x.device.type == "cpu":
             from ssa_nerfstudio.overlay._photometric_numba import value_and_gradient
 
-            planes = (image.permute(2, 0, 1).contiguous().numpy() for image in (x, y))
-            number, planes = value_and_gradient(*planes, ssim_weight, np.array(gaussian_window(), x.numpy().dtype))
+            x_planes, y_planes = (image.permute(2, 0, 1).contiguous().numpy() for image in (x, y))
+            window = np.array(gaussian_window(), x_planes.dtype)
+            number, planes = value_and_gradient(x_planes, y_planes, ssim_weight, window)
             value, gradient = x.new_tensor(number), torch.from_numpy(planes).permute(1, 2, 0)
         else:
             with torch.enable_grad():

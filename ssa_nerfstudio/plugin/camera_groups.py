@@ -44,4 +44,3 @@ def describe(cameras: Cameras) -> Tensor:
     """width, height, fx, fy, cx, cy of each camera: [N, 6] float64 on the CPU."""
     fields = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy)
     return torch.stack([f.reshape(-1).to("cpu", torch.float64) for f in fields], dim=-1)
-

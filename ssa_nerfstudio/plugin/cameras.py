@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor
 
 
+def metadata(camera: Cameras) -> dict[str, Any]:
+    """What `prepare` left with a camera, or nothing."""
+    return camera.metadata or {}
+
+
 def frame(camera: Cameras) -> tuple[int, int]:
-    """Width and height of one camera; from the host where `prepare` left them, since reading the device waits for it."""
-    known = (camera.metadata or {}).get("frame")
+    """Width and height of one camera; from the host where `prepare` left them: reading the device waits for it."""
+    known = metadata(camera).get("frame")
     return known if known is not None else (int(camera.width.item()), int(camera.height.item()))
 
 
 def intrinsics(camera: Cameras, reduction: int) -> Tensor:
     """Ks [1, 3, 3] in pixels of an image reduced by a whole factor."""
-    prepared = (camera.metadata or {}).get("Ks")
+    prepared = metadata(camera).get("Ks")
     if prepared is not None:
         return prepared[reduction]
     Ks = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(camera.device)
@@ -44,7 +51,7 @@ def prepare(cameras: Cameras, reductions: tuple[int, ...]) -> list[Cameras]:
         camera = cameras[index : index + 1]
         Ks = {reduction: intrinsics(camera, reduction) for reduction in reductions}
         camera.metadata = {
-            **(camera.metadata or {}),
+            **metadata(camera),
             "cam_idx": index,
             "frame": (widths[index], heights[index]),
             "viewmat": views[index : index + 1],

@@ -1,7 +1,7 @@
 """How the Gaussians multiply: adaptive density control (ADC) and MCMC, gsplat's strategies behind the same four calls.
 
-Both answer `initialize_state(scene_scale)`, `step_pre_backward(...)`, `step_post_backward(...)` and have `absgrad`, with
-the arguments that `SplatfactoModel` passes, so that the model does not know which one it holds.
+Both answer `initialize_state(scene_scale)`, `step_pre_backward(...)` and `step_post_backward(...)` with the arguments
+that `SplatfactoModel` passes, and have `absgrad`, so that the model does not know which one it holds.
 """
 
 from __future__ import annotations

@@ -66,7 +66,8 @@ def check_transforms(data: Path) -> None:
             finite = False
         if not finite:
             raise refuse(
-                f"{path}: the pose of {name} is no 4 x 4 matrix of finite numbers; remove that frame or register it again"
+                f"{path}: the pose of {name} is no 4 x 4 matrix of finite numbers; remove that frame "
+                "or register it again"
             )
         photo = path.parent / str(name)
         if not photo.exists() and not list(path.parent.glob(f"{photo.parent.name}_*/{photo.name}")):

@@ -10,16 +10,15 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import Parameter
 
 from ssa_nerfstudio import metrics
-from ssa_nerfstudio.errors import refuse
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, composite, fitted
+from ssa_nerfstudio.overlay.layer import composite
 from ssa_nerfstudio.overlay.losses import Sparsity, photometric, sparsity
 from ssa_nerfstudio.overlay.resampling import straight_color
-from ssa_nerfstudio.plugin.camera_groups import match_camera, nearest_aspect
-from ssa_nerfstudio.plugin.cameras import frame, intrinsics, view_matrix
+from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.cameras import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 from ssa_nerfstudio.plugin.upstream import without_lpips
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
@@ -36,7 +35,7 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
     (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
     overlay_start: Literal["statistics", "constant"] = "statistics"
-    """statistics: W = mean over the photos, A = exp(-sigma / 0.05) (paper); constant: W = 0.5, A = 0.1 (its ablation)."""
+    """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); constant: W = 0.5, A = 0.1 (its ablation)."""
     overlay_downscale: Literal[1, 2, 4] = 1
     """The overlay has one pixel for a block of this many pixels a side: 1, 1/2 or 1/4 of the photos' resolution."""
     sparsity: Sparsity = "log"
@@ -61,7 +60,7 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """ADC: measure split and prune sizes, and the means' learning rate, in units of the cameras' extent (3DGS, the
     paper) instead of the normalised scene (splatfacto)."""
     pause_after_reset: int | None = None
-    """ADC: steps without refinement after an opacity reset; None: one for each photo and a refinement's (splatfacto)."""
+    """ADC: steps without refinement after an opacity reset; None: one a photo and a refinement's (splatfacto)."""
     rasterizer: RasterizerName = "auto"
     """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""
 
@@ -69,10 +68,11 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
 class SSASplatfactoModel(SplatfactoModel):
     """Gaussian splats and, per camera group, the artifact in front of them. `rgb` is the clean render everywhere.
 
-    The overlays come from the pipeline (`set_overlays`), or from a checkpoint, whose shapes they take.
+    The artifacts come from the pipeline (`artifacts.put`), or from a checkpoint, whose shapes they take.
     """
 
     config: SSASplatfactoModelConfig
+    strategy: AdaptiveDensityControl | MarkovChainMonteCarlo
 
     def populate_modules(self) -> None:
         """Build splatfacto's Gaussians without CUDA and without downloads, then what is ours."""
@@ -88,10 +88,7 @@ class SSASplatfactoModel(SplatfactoModel):
             colors = points[1].float() / 255.0
             dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-10)
             self.gauss_params["features_dc"] = Parameter(dc)
-        self.overlays = nn.ModuleList()
-        self.register_buffer("camera_keys", torch.zeros(0, 6, dtype=torch.float64))
-        self._keys: list[list[float]] = []
-        self._group_of_view: list[int] = []
+        self.artifacts = Artifacts()
         self.scene_scale = 1.0
         self.metrics_every = 10
         self._make_strategy()
@@ -124,64 +121,23 @@ class SSASplatfactoModel(SplatfactoModel):
             self.scene_scale = extent
             self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
 
-    def set_overlays(
-        self, overlays: list[ScreenSpaceOverlay] | list[GivenOverlay], keys: Tensor, group_of_view: list[int]
-    ) -> None:
-        """Put artifacts in front of the scene.
-
-        Args:
-            overlays: one a camera group.
-            keys: [G, 6], what the groups' cameras are (`camera_groups.group_cameras`).
-            group_of_view: each training view's group.
-        """
-        self.overlays = nn.ModuleList(overlays).to(self.device)
-        self.camera_keys = keys.to(self.device)
-        self._keys = keys.tolist()
-        self._group_of_view = group_of_view
-
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.
 
-        Parameter objects stay what they are: the optimisers that hold them were built before (splatfacto replaces them,
-        splatfacto.py:392, and a resumed run then trains nothing).
+        Parameter objects stay what they are: the optimisers that hold them were built before. (splatfacto replaces
+        them, splatfacto.py:392, and a resumed run then trains nothing.)
         """
         self.step = 30000
         n = dict["gauss_params.means"].shape[0]
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
-        self._prepare_overlays(dict)
-        result = super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
-        self._keys = self.camera_keys.tolist()
-        return result
-
-    def _prepare_overlays(self, state: dict[str, Any]) -> None:
-        """Make room for a checkpoint's overlays, or refuse one that does not fit those that are being trained."""
-        frames = [
-            tuple(int(v) for v in state[f"overlays.{g}.frame"]) for g in range(len(state.get("camera_keys", ())))
-        ]
-        if len(self.overlays):
-            here = [tuple(o.frame.tolist()) for o in self.overlays]
-            if frames != here:
-                raise refuse(
-                    f"the checkpoint's overlays are (height, width, downscale) {frames or 'absent'}, this run's are {here}; "
-                    "resume with the photos, camera-res-scale-factor and overlay options that it was trained with"
-                )
-            return
-        if not frames:
-            return
-        if self.training and self.config.overlay == "off":
-            raise refuse("the checkpoint has an overlay and this run has none; resume with --pipeline.model.overlay on")
-        given = "overlays.0.transmittance" in state
-        self.overlays = nn.ModuleList(
-            GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3)) if given else ScreenSpaceOverlay(h, w, resolution)
-            for h, w, resolution in frames
-        ).to(self.device)
-        self.camera_keys = torch.zeros(len(frames), 6, dtype=torch.float64, device=self.device)
+        self.artifacts.make_room(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
+        return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
         """splatfacto's groups, and `overlay` where one is learned."""
         groups = super().get_param_groups()
-        learned = list(self.overlays.parameters())
+        learned = list(self.artifacts.parameters())
         if learned:
             groups["overlay"] = learned
         return groups
@@ -197,9 +153,12 @@ class SSASplatfactoModel(SplatfactoModel):
         reduction = self._get_downscale_factor()
         width, height = frame(camera)
         drawn = self._render(camera, width // reduction, height // reduction, reduction)
-        if not len(self.overlays):
+        if not len(self.artifacts):
             return drawn
-        transmittance, addition = self._layers_for(camera, width, height, reduction)
+        if self.training:
+            transmittance, addition = self.artifacts.layers_of_view(metadata(camera)["cam_idx"], reduction)
+        else:
+            transmittance, addition = self.artifacts.layers_of_camera(camera, width, height)
         drawn["composite"] = composite(drawn["rgb"], transmittance, addition)
         if not self.training:
             drawn["composite"] = drawn["composite"].clamp(0.0, 1.0)
@@ -246,7 +205,7 @@ class SSASplatfactoModel(SplatfactoModel):
         background = self._get_background_color()
         rgb = torch.clamp(render[0, ..., :3] + (1.0 - alpha[0]) * background, 0.0, 1.0)
         if self.config.use_bilateral_grid and self.training:
-            rgb = self._apply_bilateral_grid(rgb[None], camera.metadata["cam_idx"], height, width)[0]
+            rgb = self._apply_bilateral_grid(rgb[None], metadata(camera)["cam_idx"], height, width)[0]
         depth = None
         if with_depth:
             depth = torch.where(alpha[0] > 0, render[0, ..., 3:], render[..., 3].detach().max())
@@ -261,21 +220,13 @@ class SSASplatfactoModel(SplatfactoModel):
         """World to camera [1, 4, 4], with the camera optimiser's correction while training."""
         if not self.training:
             return view_matrix(camera.camera_to_worlds)
-        if self.camera_optimizer.config.mode == "off" and "viewmat" in camera.metadata:
-            return camera.metadata["viewmat"]
+        prepared = metadata(camera).get("viewmat")
+        if self.camera_optimizer.config.mode == "off" and prepared is not None:
+            return prepared
         return view_matrix(self.camera_optimizer.apply_to_camera(camera))
 
-    def _layers_for(self, camera: Cameras, width: int, height: int, reduction: int) -> tuple[Tensor, Tensor]:
-        """Transmittance and added light of the camera's group, in its frame at 1 / reduction."""
-        if self.training:
-            return self.overlays[self._group_of_view[camera.metadata["cam_idx"]]].layers(reduction)
-        group = match_camera(camera, self._keys)
-        if group is None:
-            group = nearest_aspect(camera, self._keys)
-        return fitted(self.overlays[group], height, width)  # pyright: ignore[reportArgumentType]
-
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
-        """The paper's loss: photometric on what the photo shows, sparsity of the matte, and the strategy's own terms."""
+        """The paper's loss: photometric on what the photo shows, sparsity of the matte, the strategy's own terms."""
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
         shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
         if "mask" in batch:
@@ -284,8 +235,9 @@ class SSASplatfactoModel(SplatfactoModel):
         losses = {"main_loss": photometric(shown, target, self.config.ssim_lambda)}
         if not self.training:
             return losses
-        if self.config.overlay == "on" and len(self.overlays) and self.config.sparsity != "off":
-            terms = [sparsity(o.matte(), o.evidence, self.config.sparsity) for o in self.overlays]
+        learned = self.artifacts.learned()
+        if learned and self.config.sparsity != "off":
+            terms = [sparsity(overlay.matte(), overlay.evidence, self.config.sparsity) for overlay in learned]
             losses["sparsity"] = self.config.sparsity_weight * torch.stack(terms).mean()
         if self.config.strategy == "mcmc":
             losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()

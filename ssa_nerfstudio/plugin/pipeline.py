@@ -76,7 +76,7 @@ class SSAPipeline(VanillaPipeline):
                     views = ((photo["image"], photo.get("mask")) for photo in members)
                     label = f"Statistics of camera {g + 1} of {len(overlays)}"
                     overlay.start_from(accumulate(track(views, label, total=len(members), transient=True)))
-        self.model.set_overlays(overlays, keys, groups)
+        self.model.artifacts.put(overlays, keys, groups)
 
 
 def _source(config: SSAPipelineConfig) -> Path:
@@ -92,7 +92,9 @@ def _extent(positions: torch.Tensor) -> float:
 def _load_given(path: Path | None, sizes: list[tuple[int, int]]) -> list[GivenOverlay]:
     """The true layers of every camera group from an .npz file."""
     if path is None:
-        raise refuse("overlay 'given' needs the layers; add --pipeline.model.overlay-given FILE.npz with arrays T and B")
+        raise refuse(
+            "overlay 'given' needs the layers; add --pipeline.model.overlay-given FILE.npz with arrays T and B"
+        )
     try:
         arrays = np.load(path)
         names = [("T", "B")] if len(sizes) == 1 and "T" in arrays else [(f"T{g}", f"B{g}") for g in range(len(sizes))]

@@ -6,7 +6,7 @@ import copy
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from nerfstudio.engine.trainer import TrainerConfig
+    from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
 
 FULL_LENGTH = 30_000
 """Steps that every schedule of splatfacto and 3DGS assumes."""
@@ -23,7 +23,7 @@ _MODEL_STEPS = (
 )
 
 
-def scaled(config: TrainerConfig) -> TrainerConfig:
+def scaled(config: SSATrainerConfig) -> SSATrainerConfig:
     """A copy of a run's configuration with every schedule scaled by its number of steps / 30000.
 
     Scaled are: learning-rate decay and warm-up, the resolution schedule, spherical harmonics, the refinement's start,

@@ -10,6 +10,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
+from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.schedules import scaled
 
 
@@ -29,6 +30,8 @@ class SSATrainerConfig(TrainerConfig):
     """Configuration of `SSATrainer`."""
 
     _target: type = field(default_factory=lambda: SSATrainer)
+    pipeline: SSAPipelineConfig = field(default_factory=SSAPipelineConfig)
+    """Photos, cameras, scene and artifact."""
     scale_schedules: bool = True
     """Scale every schedule by max_num_iterations / 30000, so that a shorter run is the whole run made shorter and not
     its beginning."""
@@ -38,15 +41,16 @@ class SSATrainer(Trainer):
     """`Trainer` for the methods of this plugin."""
 
     config: SSATrainerConfig
+    pipeline: SSAPipeline
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         check_device(config.machine.device_type)
         if config.scale_schedules:
-            config = scaled(config)  # pyright: ignore[reportAssignmentType]
+            config = scaled(config)
         super().__init__(config, local_rank, world_size)
 
     def setup_optimizers(self) -> Optimizers:
-        """Optimisers of the configuration; the means' learning rate in units of the scene where the model asks for it."""
+        """Optimisers of the configuration; the means' learning rate in units of the scene where the model asks so."""
         self.pipeline.model.metrics_every = max(1, self.config.logging.steps_per_log)
         scale = self.pipeline.model.scene_scale
         if scale != 1.0:

@@ -1,4 +1,4 @@
-"""What nerfstudio 1.1.5 and gsplat 1.4.0 need mended: one function a repair, each with its reason and the day it may go."""
+"""What nerfstudio 1.1.5 and gsplat 1.4.0 need mended: a function a repair, with its reason and the day it may go."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from typing import Any
 
 import gsplat.strategy.ops
 import numpy as np
@@ -29,16 +30,15 @@ def allow_checkpoint_scalars() -> None:
     if not hasattr(torch.serialization, "add_safe_globals"):
         return
     reconstruct = np.float64(0).__reduce__()[0]
-    torch.serialization.add_safe_globals(
-        [
-            reconstruct,
-            # numpy 2 renamed the module; checkpoints written under the other major version name it the other way.
-            (reconstruct, "numpy.core.multiarray.scalar"),
-            (reconstruct, "numpy._core.multiarray.scalar"),
-            np.dtype,
-            *{type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64, np.bool_)},
-        ]
-    )
+    allowed: list[Any] = [
+        reconstruct,
+        # numpy 2 renamed the module; checkpoints written under the other major version name it the other way.
+        (reconstruct, "numpy.core.multiarray.scalar"),
+        (reconstruct, "numpy._core.multiarray.scalar"),
+        np.dtype,
+        *{type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64, np.bool_)},
+    ]
+    torch.serialization.add_safe_globals(allowed)
 
 
 def bring_ffmpeg() -> None:

@@ -1,8 +1,8 @@
 """Numba kernels of the `cpu` rasterizer: projection of Gaussians and spherical harmonics, forward and backward.
 
-The formulas are those of `projection.project` (EWA splatting, Zwicker et al. 2002, as in gsplat 1.4.0), chained by hand:
-some two hundred small torch operations forward and back take longer than blending the splats does. Each thread owns a
-contiguous range of Gaussians; a Gaussian's gradients depend on it alone, so results do not depend on the threads.
+The formulas are those of `projection.project` (EWA splatting, Zwicker et al. 2002, as in gsplat 1.4.0), chained by
+hand: some two hundred small torch operations forward and back take longer than blending the splats does. Each thread
+owns a contiguous range of Gaussians; a Gaussian's gradients depend on it alone, so results do not depend on the threads.
 """
 
 from __future__ import annotations
@@ -158,7 +158,10 @@ def backpropagate_projection(
         r = v_rotation
         v_w = 2 * (qx * (r[2, 1] - r[1, 2]) + qy * (r[0, 2] - r[2, 0]) + qz * (r[1, 0] - r[0, 1]))
         v_qx = 2 * (
-            -2 * qx * (r[1, 1] + r[2, 2]) + qy * (r[0, 1] + r[1, 0]) + qz * (r[0, 2] + r[2, 0]) + w * (r[2, 1] - r[1, 2])
+            -2 * qx * (r[1, 1] + r[2, 2])
+            + qy * (r[0, 1] + r[1, 0])
+            + qz * (r[0, 2] + r[2, 0])
+            + w * (r[2, 1] - r[1, 2])
         )
         v_qy = 2 * (
             qx * (r[0, 1] + r[1, 0]) - 2 * qy * (r[0, 0] + r[2, 2]) + qz * (r[1, 2] + r[2, 1]) + w * (r[0, 2] - r[2, 0])

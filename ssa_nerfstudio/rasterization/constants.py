@@ -1,6 +1,7 @@
 """The constants of gsplat 1.4.0's rasterizer that any other body has to share to draw the same picture.
 
-Source: `gsplat/cuda/csrc/rasterize_to_pixels_fwd.cu` and `gsplat/rendering.py` at version 1.4.0. Pixel centres lie at +0.5.
+Source: `gsplat/cuda/csrc/rasterize_to_pixels_fwd.cu` and `gsplat/rendering.py` at version 1.4.0. Pixel centres lie at
++0.5.
 """
 
 EPS2D = 0.3

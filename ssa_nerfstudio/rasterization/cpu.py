@@ -1,4 +1,4 @@
-"""The rasterizer for machines without CUDA: numba, forward and hand-written backward, deterministic for any thread count."""
+"""The rasterizer without CUDA: numba, forward and hand-written backward, deterministic for any number of threads."""
 
 from __future__ import annotations
 
@@ -19,7 +19,16 @@ def blend(
 ) -> tuple[Tensor, Tensor]:
     """Blend one camera's splats, front to back. See `interface.Blend`; float32 or float64."""
     return _Blend.apply(
-        means2d, splats.conics, splats.opacities, splats.colors, splats.ids, splats.radii, camera, width, height, absgrad
+        means2d,
+        splats.conics,
+        splats.opacities,
+        splats.colors,
+        splats.ids,
+        splats.radii,
+        camera,
+        width,
+        height,
+        absgrad,
     )  # pyright: ignore[reportReturnType]
 
 

@@ -1,4 +1,4 @@
-"""The signature that every rasterizer here has: gsplat's `rasterization`, built around a function that blends splats."""
+"""The signature that every rasterizer here has: gsplat's `rasterization`, around a function that blends splats."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ssa_nerfstudio.rasterization import constants
 from ssa_nerfstudio.rasterization.projection import Splats, project
 
 Blend = Callable[[Splats, Tensor, int, int, int, bool], tuple[Tensor, Tensor]]
-"""`blend(splats, means2d, camera, width, height, absgrad)` returns red, green, blue, depth [H, W, 4] and alpha [H, W, 1].
+"""`blend(splats, means2d, camera, width, height, absgrad)` returns colour and depth [H, W, 4] and alpha [H, W, 1].
 
 `means2d` [C, N, 2] holds the splats' centres at `means2d[camera, splats.ids]`; gradients of the centres go through it,
 because densification reads them there (and, where `absgrad`, their sum of magnitudes as `means2d.absgrad`).

@@ -54,9 +54,7 @@ def config(tiny_scene, tmp_path_factory) -> Path:
     process.wait()
     saved = max(int(path.stem.removeprefix("step-")) for path in checkpoints.glob("step-*.ckpt"))
     assert saved < 399
-    command(
-        "ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "resumed", "--load-dir", checkpoints
-    )
+    command("ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "resumed", "--load-dir", checkpoints)
     return checkpoints.parent.parent / "resumed" / "config.yml"
 
 
@@ -77,7 +75,9 @@ def test_eval_writes_the_metrics_of_the_clean_render(config, tmp_path):
 
 def test_render_dataset_writes_every_layer(config, tmp_path):
     names = ("rgb", "composite", "overlay_rgb", "overlay_alpha")
-    command("ns-render", "dataset", "--load-config", config, "--output-path", tmp_path, "--rendered-output-names", *names)
+    command(
+        "ns-render", "dataset", "--load-config", config, "--output-path", tmp_path, "--rendered-output-names", *names
+    )
     pictures = {name: np.asarray(Image.open(next((tmp_path / "test" / name).iterdir()))) for name in names}
     assert all(picture.shape[:2] == (48, 64) for picture in pictures.values())
     # ns-render draws one channel in the colour map "turbo": 1 is red, 0 is blue.

@@ -26,7 +26,7 @@ def gaussians(n: int, seed: int = 0) -> tuple[torch.nn.ParameterDict, dict[str, 
         {name: torch.nn.Parameter(0.5 * torch.randn(shape, generator=generator)) for name, shape in shapes.items()}
     )
     params["scales"].data -= 4
-    optimizers = {name: torch.optim.Adam([p], lr=1e-3) for name, p in params.items()}
+    optimizers: dict[str, torch.optim.Optimizer] = {name: torch.optim.Adam([p], lr=1e-3) for name, p in params.items()}
     for name, p in params.items():
         p.grad = torch.ones_like(p)
         optimizers[name].step()
@@ -150,4 +150,5 @@ def test_the_noise_follows_the_learning_rate_of_the_means():
 def test_covariances_on_a_cpu_are_rotated_squared_scales():
     quats, scales = torch.tensor([[math.sqrt(0.5), 0, 0, math.sqrt(0.5)]]), torch.tensor([[1.0, 2.0, 3.0]])
     covars, _ = ops.quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+    assert covars is not None
     torch.testing.assert_close(covars[0], torch.diag(torch.tensor([4.0, 1.0, 9.0])), atol=1e-5, rtol=0)

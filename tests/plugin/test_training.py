@@ -50,7 +50,7 @@ def test_an_overlay_recovers_the_scene_behind_a_dashboard(trained):
 def test_the_matte_learned_is_the_dashboard(trained):
     _, pipeline, _ = trained["on"]
     truth = Dashboard().layers(48, 64, np.random.default_rng(0)).matte
-    matte = pipeline.model.overlays[0].matte().detach().numpy()[..., 0]
+    matte = pipeline.model.artifacts.learned()[0].matte().detach().numpy()[..., 0]
     assert matte[truth > 0.99].mean() > 0.9
     assert matte[truth < 0.01].mean() < 0.15
 
@@ -85,13 +85,14 @@ def test_a_given_overlay_is_buffers_and_does_not_learn(trained):
     _, pipeline, _ = trained["given"]
     layers = Dashboard().layers(48, 64, np.random.default_rng(0))
     assert "overlay" not in pipeline.get_param_groups()
-    np.testing.assert_array_equal(pipeline.model.overlays[0].transmittance.numpy(), layers.transmittance)
-    np.testing.assert_array_equal(pipeline.model.overlays[0].addition.numpy(), layers.addition)
+    transmittance, addition = pipeline.model.artifacts[0].layers()
+    np.testing.assert_array_equal(transmittance.numpy(), layers.transmittance)
+    np.testing.assert_array_equal(addition.numpy(), layers.addition)
 
 
 @pytest.mark.parametrize("kind", ["off", "on", "given"])
 def test_a_checkpoint_reloads_without_opening_a_photo(trained, kind):
-    outcome, pipeline, path = trained[kind]
+    _, pipeline, path = trained[kind]
     _, reloaded, _, _ = eval_setup(path, test_mode="inference")
     state, expected = reloaded.model.state_dict(), pipeline.model.state_dict()
     assert state.keys() == expected.keys()
@@ -166,7 +167,7 @@ def test_settings_can_be_combined(tiny_scene, tmp_path, model):
     outcome, pipeline, _ = train_and_evaluate(configure("ssa-splatfacto", tiny_scene, tmp_path, 4, model))
     assert np.isfinite(outcome.metrics["psnr"])
     size = -(-48 // model.get("overlay_downscale", 1)), -(-64 // model.get("overlay_downscale", 1))
-    assert pipeline.model.overlays[0].matte().shape[:2] == size
+    assert pipeline.model.artifacts.learned()[0].matte().shape[:2] == size
 
 
 def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path):
@@ -175,7 +176,7 @@ def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path
     deviation = accumulate((photo["image"], None) for photo in photos).deviation()
     expected = torch.exp(-deviation / 0.05).clamp(0.01, 0.99).float()
     # One step of Adam moves every logit by 0.005.
-    drift = pipeline.model.overlays[0].alpha_logits.detach() - expected.logit()
+    drift = pipeline.model.artifacts.learned()[0].alpha_logits.detach() - expected.logit()
     assert drift.abs().max() < 0.0051
 
 
@@ -188,7 +189,7 @@ def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path):
     Image.fromarray(mask).save(broken_scene / "mask.png")
     edit_transforms(broken_scene, frames=[{**frame, "mask_path": "mask.png"} for frame in frames])
     _, pipeline, _ = run(broken_scene, tmp_path, 3)
-    matte = pipeline.model.overlays[0].matte().detach()
+    matte = pipeline.model.artifacts.learned()[0].matte().detach()
     assert matte[:10, :10].max() < 0.02
 
 
@@ -202,12 +203,14 @@ def test_a_rig_gets_an_overlay_for_each_of_its_cameras(broken_scene, tmp_path):
     path.write_text(json.dumps({k: v for k, v in transforms.items() if k not in shared}))
     _, pipeline, config = run(broken_scene, tmp_path, 4)
     model = pipeline.model
-    assert len(model.overlays) == 2
-    assert model.camera_keys[:, 4].tolist() == sorted(model.camera_keys[:, 4].tolist())
-    assert set(model._group_of_view) == {0, 1}
-    assert not torch.equal(model.overlays[0].alpha_logits, model.overlays[1].alpha_logits)
+    assert len(model.artifacts) == 2
+    assert model.artifacts.camera_keys[:, 4].tolist() == sorted(model.artifacts.camera_keys[:, 4].tolist())
+    assert set(model.artifacts._group_of_view) == {0, 1}
+    assert not torch.equal(model.artifacts.learned()[0].alpha_logits, model.artifacts.learned()[1].alpha_logits)
     _, reloaded, _, _ = eval_setup(config, test_mode="inference")
-    assert len(reloaded.model.overlays) == 2
+    assert [name for name in reloaded.state_dict() if name.endswith("alpha_logits")] == [
+        f"_model.artifacts.overlays.{g}.alpha_logits" for g in (0, 1)
+    ]
 
 
 def test_a_free_viewpoint_of_any_aspect_shows_the_overlay_unstretched(trained):
