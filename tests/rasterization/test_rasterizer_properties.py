@@ -191,6 +191,29 @@ def test_where_nothing_is_visible_the_picture_is_the_background(name: str, n: in
         assert leaf.grad is None or (leaf.grad == 0).all(), key
 
 
+def test_a_graph_that_is_kept_gives_the_same_gradients_again() -> None:
+    gaussians, viewmats, Ks = scene(50, 24, 20)
+    leaves = {key: value.clone().requires_grad_() for key, value in gaussians.items()}
+    render, alpha, _ = cpu.rasterization(**leaves, viewmats=viewmats, Ks=Ks, width=24, height=20, sh_degree=3)
+    total = (render**2).sum() + alpha.sum()
+    once, again = (torch.autograd.grad(total, list(leaves.values()), retain_graph=True) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(once, again, strict=True))
+    assert all(gradient.abs().max() > 0 for gradient in once)
+
+
+@every_body
+def test_the_picture_is_the_same_without_gradients(name: str) -> None:
+    made = scene(50, 24, 20)
+    drawn = draw(BODIES[name], *made, 24, 20)
+    with torch.no_grad():
+        render, alpha, info = BODIES[name](
+            **made[0], viewmats=made[1], Ks=made[2], width=24, height=20, sh_degree=3, render_mode="RGB+ED"
+        )
+    assert torch.equal(render, torch.cat([drawn["image"], drawn["depth"]], dim=-1))
+    assert torch.equal(alpha, drawn["alpha"])
+    assert not info["means2d"].requires_grad
+
+
 def test_info_tells_densification_what_it_reads() -> None:
     gaussians, viewmats, Ks = scene(40, 24, 20, cameras=2)
     gaussians["means"][:7] += 1000
