@@ -28,7 +28,7 @@ class UI:
     """
 
     scale: float = 1.0
-    """Size of all elements; at 1 an action button is 0.1 of the frame's shorter side, in [0.2, 1.5]."""
+    """Size of all elements, in [0.2, 1]; at 1 a button's side is 0.1 of the frame's height or 1 / 13 of its width."""
     panel_alpha: float = 0.65
     """Opacity of panels and empty buttons, in (0, 1]."""
     panel_colour: Colour = (18, 22, 30)
@@ -41,7 +41,7 @@ class UI:
     """The line at the upper edge; may be empty."""
 
     def __post_init__(self) -> None:
-        require(self, scale="[0.2, 1.5]", panel_alpha="(0, 1]")
+        require(self, scale="[0.2, 1]", panel_alpha="(0, 1]")
         require_colours(self, "panel_colour", "accent_colour", "text_colour")
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
@@ -71,7 +71,8 @@ class _Painter:
         """An empty canvas; lengths are in units of an action button's side."""
         self.canvas = Image.new("RGBA", (width, height))
         self._draw = ImageDraw.Draw(self.canvas)
-        self._unit = 0.1 * style.scale * min(height, width)
+        # The lower edge holds 13 units side by side.
+        self._unit = style.scale * min(height / 10, width / 13)
         self._right, self._bottom = width / self._unit, height / self._unit
         self._panel = (*style.panel_colour, round(255 * style.panel_alpha))
         self._accent, self._text_colour = (*style.accent_colour, 255), (*style.text_colour, 255)
@@ -162,4 +163,13 @@ class _Painter:
 
     def _text(self, x: float, y: float, size: float, text: str, fill: tuple[int, ...]) -> None:
         font = ImageFont.load_default(max(1.0, size * self._unit))
-        self._draw.text((x * self._unit, y * self._unit), text, fill=fill, font=font, anchor="mm")
+        outline = round(0.07 * size * self._unit)
+        self._draw.text(
+            (x * self._unit, y * self._unit),
+            text,
+            fill=fill,
+            font=font,
+            anchor="mm",
+            stroke_width=outline,
+            stroke_fill=(10, 12, 16, 255),
+        )

@@ -1,8 +1,8 @@
 """Numba kernels of the `cpu` rasterizer: projection of Gaussians and spherical harmonics, forward and backward.
 
 The formulas are those of `projection.project` (EWA splatting, Zwicker et al. 2002, as in gsplat 1.4.0), chained by
-hand: some two hundred small torch operations forward and back take longer than blending the splats does. Each thread
-owns a contiguous range of Gaussians; a Gaussian's gradients depend on it alone, so results do not depend on the threads.
+hand: some two hundred small torch operations forward and back take longer than blending the splats does. A thread owns
+a contiguous range of Gaussians; a Gaussian's gradients depend on it alone, so results do not depend on the threads.
 """
 
 from __future__ import annotations
