@@ -28,8 +28,13 @@ def scene(
     sh_degree: int | None = 3,
     cameras: int = 1,
 ) -> Scene:
-    """`random_scene` seen by cameras that stand around it, with no more colour coefficients than `sh_degree` needs."""
-    gaussians, _, Ks = random_scene(n, width, height, size, dtype, seed)
+    """`random_scene`, its cube around (0, 0, 3), seen by cameras around it; numbers that float32 holds exactly.
+
+    No more colour coefficients than `sh_degree` needs; camera 0 is the identity.
+    """
+    gaussians, viewmats, Ks = random_scene(n, width, height, size, dtype, seed)
+    in_camera = gaussians["means"] @ viewmats[0, :3, :3].T + viewmats[0, :3, 3]
+    gaussians["means"] = in_camera.float().to(dtype)
     colors = gaussians["colors"]
     gaussians["colors"] = colors[:, 0].abs() if sh_degree is None else colors[:, : (sh_degree + 1) ** 2].contiguous()
     viewmats = torch.stack([view(0.4 * camera, dtype) for camera in range(cameras)])

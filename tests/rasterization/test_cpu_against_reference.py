@@ -8,7 +8,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rasterization_scenes import assert_cpu_agrees_with_reference, scene
+from rasterization_scenes import assert_cpu_agrees_with_reference, cast, scene
+
+from ssa_nerfstudio.benchmark.rasterizers import random_scene
 
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 
@@ -21,6 +23,15 @@ def test_image_alpha_depth_and_every_gradient_agree(seed: int, dtype: torch.dtyp
         oracle
     )
     assert all(value.abs().max() > 0 for value in oracle.values())
+
+
+@both_dtypes
+@pytest.mark.parametrize("seed", range(2))
+def test_a_camera_in_general_position_agrees(seed: int, dtype: torch.dtype) -> None:
+    made = cast(random_scene(200, 37, 29, 0.06, torch.float32, seed), torch.float64)
+    oracle = assert_cpu_agrees_with_reference(made, 37, 29, dtype)
+    assert (oracle["d means"].abs().amax(dim=0) > 0).all()
+    assert oracle["alpha"].max() > 0.5
 
 
 @both_dtypes
