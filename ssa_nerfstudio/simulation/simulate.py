@@ -6,6 +6,7 @@ import json
 import shutil
 from pathlib import Path, PurePosixPath
 
+from rich.console import Console
 from rich.progress import Progress
 
 from ssa_nerfstudio.errors import refuse
@@ -37,8 +38,11 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
     renamed = {path: str(PurePosixPath(path).with_suffix(".png")) for path in corrupted}
     names = {view.path: view.path for view in dataset.views} | renamed
     _check_names(names)
+    console = Console()
+    # Where there is no terminal, an ended bar leaves an empty line.
+    progress = Progress(console=console, transient=True, disable=not console.is_terminal)
     try:
-        with staged_folder(output) as folder, Progress(transient=True) as progress:
+        with staged_folder(output) as folder, progress:
             task = progress.add_task("Simulating", total=len(dataset.views))
             for view in dataset.views:
                 if view.path not in renamed:

@@ -15,6 +15,7 @@ import yaml
 from PIL import Image
 from small_datasets import contents, edit, pixels, write_dataset
 
+from ssa_nerfstudio.benchmark.simulator import measure
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.effects.catalogue import EFFECTS
 from ssa_nerfstudio.effects.layers import Layers
@@ -23,7 +24,7 @@ from ssa_nerfstudio.overlay.lens import undistort
 from ssa_nerfstudio.simulation import corruption
 from ssa_nerfstudio.simulation.dataset import Dataset
 from ssa_nerfstudio.simulation.layer_files import read_view
-from ssa_nerfstudio.simulation.photos import read_photo, write_photo
+from ssa_nerfstudio.simulation.photos import write_photo
 from ssa_nerfstudio.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.simulation.simulate import simulate
 
@@ -233,26 +234,8 @@ def test_memory_does_not_grow_with_the_number_of_photos(tmp_path):
 
 def test_half_of_the_bare_rate_is_kept(tmp_path):
     data = write_dataset(tmp_path / "data", views=20, width=800, height=600)
-    dataset, scene = Dataset.read(data, 8), Scene(read_effects(("watermark",)))
-    train = [view for view in dataset.views if view.role == "train"]
-
-    def bare(attempt: int) -> None:
-        for view in train:
-            photo = read_photo(dataset.source(view.path), view.lens.width, view.lens.height)
-            write_photo(tmp_path / f"bare{attempt}" / f"{Path(view.path).stem}.png", photo)
-
-    def seconds(work) -> float:
-        started = time.process_time()
-        work()
-        return time.process_time() - started
-
-    scene.draw(8, 8)
-    ratios = []
-    for attempt in range(3):
-        copied = seconds(lambda n=attempt: bare(n))
-        simulated = seconds(lambda n=attempt: simulate(dataset, scene, tmp_path / f"out{n}", threads=1))
-        ratios.append(copied / simulated)
-    assert max(ratios) >= 0.5
+    bare, simulated = measure(Dataset.read(data, 8), "watermark", threads=1, repeats=3, clock=time.process_time)
+    assert bare / simulated >= 0.5
 
 
 @pytest.mark.parametrize("arguments", [[], ["--effects", "ui", "--scene", "stock-video"]])
