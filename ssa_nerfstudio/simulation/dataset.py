@@ -17,6 +17,7 @@ _FISHEYE = {"OPENCV_FISHEYE"}
 _PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _COMPANIONS: tuple[tuple[Kind, str], ...] = (("masks", "mask_path"), ("depths", "depth_file_path"))
+_COLMAP_MODEL = "colmap/sparse/0"
 _SPLITS = ("train_filenames", "val_filenames", "test_filenames")
 
 
@@ -113,15 +114,14 @@ class Dataset:
         given = {name: self._known(name, paths) for name in _SPLITS if name in self.meta}
         if self.split_by_interval:
             test = paths[:: self.eval_interval]
-            return [path for path in paths if path not in set(test)], test, test
+            return _without(paths, test), test, test
         train = given.get("train_filenames")
         val = given.get("val_filenames", given.get("test_filenames"))
         test = given.get("test_filenames", val)
         if train is None:
-            held_out = {*(val or []), *(test or [])}
-            train = [path for path in paths if path not in held_out]
+            train = _without(paths, [*(val or []), *(test or [])])
         if val is None or test is None:
-            val = test = [path for path in paths if path not in set(train)]
+            val = test = _without(paths, train)
         return train, val, test
 
     @property
@@ -131,8 +131,15 @@ class Dataset:
 
     @property
     def points(self) -> list[str]:
-        """Files of the sparse points, relative to `root`."""
-        return [self.meta["ply_file_path"]] if "ply_file_path" in self.meta else []
+        """Files of the sparse points, relative to `root`.
+
+        Where an older dataset lacks the .ply or the transform that was applied, nerfstudio looks at COLMAP's model.
+        """
+        stated = [self.meta["ply_file_path"]] if "ply_file_path" in self.meta else []
+        if stated and "applied_transform" in self.meta:
+            return stated
+        model = sorted(path for path in (self.root / _COLMAP_MODEL).glob("*") if path.is_file())
+        return stated + [f"{_COLMAP_MODEL}/{path.name}" for path in model]
 
     def source(self, path: str, kind: Kind = "images") -> Path:
         """File of a photo, mask or depth map at the resolution that is read, found as nerfstudio finds it."""
@@ -198,3 +205,8 @@ class Dataset:
         for view in self.views:
             if not self.source(view.path).is_file():
                 raise refuse(f"{self.source(view.path)} does not exist; put the photo there or remove its frame")
+
+
+def _without(paths: list[str], others: list[str]) -> list[str]:
+    excluded = {*others}
+    return [path for path in paths if path not in excluded]

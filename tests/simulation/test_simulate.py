@@ -124,7 +124,9 @@ def test_no_effect_copies_every_file_and_adds_the_split(tmp_path):
     mask = {"mask_path": "masks/m.png"}
     data = write_dataset(tmp_path / "data", width=20, height=10)
     frames = [frame | mask for frame in json.loads((data / "transforms.json").read_text())["frames"]]
-    before = edit(data, frames=frames, aabb_scale=4, applied_transform=np.eye(4)[:3].tolist())
+    before = edit(data, frames=frames, aabb_scale=4)
+    (data / "colmap/sparse/0").mkdir(parents=True)
+    (data / "colmap/sparse/0/points3D.bin").write_bytes(b"points")
     (data / "masks").mkdir()
     Image.new("L", (20, 10), 255).save(data / "masks/m.png")
     meta = run(data, tmp_path / "out", "--effects")
