@@ -12,6 +12,7 @@ from ssa_nerfstudio.overlay.resampling import (
     letterbox,
     reduced_size,
     stack_premultiplied,
+    straight_color,
     to_training_scale,
 )
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
@@ -35,6 +36,32 @@ def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
         addition: [H, W, 3], not negative.
     """
     return transmittance * clean + addition
+
+
+def composite_over_splats(
+    clean: Tensor, accumulation: Tensor, background: Tensor, transmittance: Tensor, addition: Tensor
+) -> Tensor:
+    """`composite`, with a gradient of the matte that sees splats only: an overlay gains nothing by hiding background.
+
+    Where no splat covers a pixel, the render shows the background colour (in splatfacto a random one at every step).
+    Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
+    Here the matte is judged as if the overlay's own colour stood behind the splats: there, nothing is gained, sparsity
+    takes the overlay back, and the scene has to fill the hole.
+
+    Args:
+        clean: [H, W, 3], the render with its background.
+        accumulation: [H, W, 1], opacity of the splats.
+        background: [3], the colour behind them.
+        transmittance, addition: [H, W, 1] and [H, W, 3].
+
+    Returns:
+        [H, W, 3], the same values as `composite`.
+    """
+    picture = composite(clean, transmittance, addition)
+    with torch.no_grad():
+        color, _ = straight_color(transmittance, addition)
+        without_background = (1.0 - accumulation) * (color - background)
+    return picture + (transmittance - transmittance.detach()) * without_background
 
 
 class ScreenSpaceOverlay(nn.Module):

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from ssa_nerfstudio import metrics
-from ssa_nerfstudio.overlay.layer import composite
+from ssa_nerfstudio.overlay.layer import composite, composite_over_splats
 from ssa_nerfstudio.overlay.losses import Sparsity, photometric, sparsity
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.artifacts import Artifacts
@@ -42,6 +42,8 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """What keeps the overlay empty: log (concave, weighted by evidence), l1 (the paper's), off."""
     sparsity_weight: float = 0.05
     """Weight of the sparsity term, the paper's lambda_sparse; not negative."""
+    ignore_background: bool = True
+    """The overlay gains nothing by hiding background that no splat covers (a sky without points); the paper's does."""
     strategy: Literal["adc", "mcmc"] = "adc"
     """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
     cap_max: int = 1_000_000
@@ -159,6 +161,11 @@ class SSASplatfactoModel(SplatfactoModel):
             transmittance, addition = self.artifacts.layers_of_view(metadata(camera)["cam_idx"], reduction)
         else:
             transmittance, addition = self.artifacts.layers_of_camera(camera, width, height)
+        if self.training and self.config.ignore_background and self.artifacts.learned():
+            drawn["composite"] = composite_over_splats(
+                drawn["rgb"], drawn["accumulation"], drawn["background"], transmittance, addition
+            )
+            return drawn
         drawn["composite"] = composite(drawn["rgb"], transmittance, addition)
         if not self.training:
             drawn["composite"] = drawn["composite"].clamp(0.0, 1.0)
