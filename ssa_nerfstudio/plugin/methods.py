@@ -90,6 +90,7 @@ ssa_splatfacto_paper = MethodSpecification(
             stop_screen_size_at=0,
             scale_by_extent=True,
             pause_after_reset=0,
+            ignore_background=False,
         ),
     ),
     description="The protocol of the SSA-3DGS paper: 3DGS's own settings and the l1 sparsity of 0.05.",
