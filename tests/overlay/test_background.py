@@ -1,0 +1,68 @@
+"""An overlay gains nothing by hiding background that no splat covers."""
+
+from __future__ import annotations
+
+import torch
+
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay, composite, composite_over_splats
+
+
+def scene(accumulation: float) -> tuple[ScreenSpaceOverlay, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """A grey-blue overlay over splats of the same colour and the given opacity, in front of a red background."""
+    overlay = ScreenSpaceOverlay(4, 5).double()
+    color = torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
+    with torch.no_grad():
+        overlay.color_logits.copy_(color.logit().expand_as(overlay.color_logits))
+    background = torch.tensor([0.9, 0.1, 0.1], dtype=torch.float64)
+    opacity = torch.full((4, 5, 1), accumulation, dtype=torch.float64)
+    clean = opacity * color + (1 - opacity) * background
+    return overlay, clean, opacity, background
+
+
+def matte_gradient(accumulation: float, over_splats: bool) -> torch.Tensor:
+    """How the error to a photo of the overlay's colour changes with the matte."""
+    overlay, clean, opacity, background = scene(accumulation)
+    transmittance, addition = overlay.layers()
+    if over_splats:
+        picture = composite_over_splats(clean, opacity, background, transmittance, addition)
+    else:
+        picture = composite(clean, transmittance, addition)
+    (picture - overlay.color().detach()).square().sum().backward()
+    assert overlay.alpha_logits.grad is not None
+    return overlay.alpha_logits.grad
+
+
+def test_the_picture_is_that_of_plain_compositing():
+    overlay, clean, opacity, background = scene(0.3)
+    layers = overlay.layers()
+    torch.testing.assert_close(
+        composite_over_splats(clean, opacity, background, *layers), composite(clean, *layers), rtol=0, atol=1e-15
+    )
+
+
+def test_plain_compositing_rewards_hiding_a_hole_and_this_does_not():
+    assert (matte_gradient(0.0, over_splats=False) < 0).all()
+    assert matte_gradient(0.0, over_splats=True).abs().max() < 1e-12
+
+
+def test_splats_that_explain_the_photo_leave_nothing_to_gain():
+    assert matte_gradient(0.6, over_splats=True).abs().max() < 1e-12
+
+
+def test_where_splats_are_opaque_the_gradient_is_the_plain_one():
+    torch.testing.assert_close(matte_gradient(1.0, True), matte_gradient(1.0, False), rtol=1e-12, atol=1e-15)
+
+
+def test_splats_and_colour_get_the_plain_gradient():
+    overlay, clean, opacity, background = scene(0.4)
+    gradients = []
+    for function in (
+        lambda c, t, b: composite(c, t, b),
+        lambda c, t, b: composite_over_splats(c, opacity, background, t, b),
+    ):
+        leaf = clean.clone().requires_grad_()
+        overlay.zero_grad()
+        (function(leaf, *overlay.layers()) ** 2).sum().backward()
+        gradients.append((leaf.grad, overlay.color_logits.grad))
+    for ours, plain in zip(gradients[1], gradients[0], strict=True):
+        torch.testing.assert_close(ours, plain)
