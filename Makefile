@@ -25,7 +25,7 @@ $(READY): pyproject.toml Makefile
 	@touch $@
 
 demo: $(READY)
-	$(BIN)/ssa demo $(if $(DATA),--data $(DATA)) $(DEMO_OPTIONS)
+	$(BIN)/ssa demo $(if $(DATA),--data "$(DATA)") $(DEMO_OPTIONS)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal

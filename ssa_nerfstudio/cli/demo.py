@@ -50,7 +50,7 @@ class Command:
                 demonstration = run.demonstrate(self.output, self.steps, on_step)
             else:
                 name = self.data.resolve().stem
-                runs = self.output / "runs"
+                runs = self.output / "demo-runs"
                 compared = run.compare(name, self.data, runs, self.steps, on_step, {}, self.scale_factor)
                 demonstration = run.Demonstration([compared])
         command = f"ssa demo --steps {self.steps}"

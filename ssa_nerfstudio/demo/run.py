@@ -65,21 +65,20 @@ def demonstrate(output: Path, steps: int, on_step: Callable[[str, str, int], Non
     """Build the scene behind each artifact and train both methods on it.
 
     Args:
-        output: folder for datasets and runs; its `data` and `runs` are replaced.
+        output: folder for datasets and runs; its `demo-data` and `demo-runs` are replaced.
         steps: training steps of each run.
         on_step: called with (dataset, method, finished steps).
     """
     scene = DemoScene()
-    shutil.rmtree(output / "data", ignore_errors=True)
-    shutil.rmtree(output / "runs", ignore_errors=True)
-    (output / "data").mkdir(parents=True)
+    data, runs = output / "demo-data", output / "demo-runs"
+    shutil.rmtree(data, ignore_errors=True)
+    shutil.rmtree(runs, ignore_errors=True)
+    data.mkdir(parents=True)
     demonstration = Demonstration()
     for name, artifact in ARTIFACTS.items():
         layers = artifact().layers(scene.height, scene.width, np.random.default_rng(0))
-        scene.write(output / "data" / name, layers)
-        demonstration.comparisons.append(
-            compare(name, output / "data" / name, output / "runs", steps, on_step, SMALL_SCENE)
-        )
+        scene.write(data / name, layers)
+        demonstration.comparisons.append(compare(name, data / name, runs, steps, on_step, SMALL_SCENE))
     return demonstration
 
 

@@ -76,10 +76,12 @@ class Artifacts(nn.Module):
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
         if len(self):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
-            if frames != here:
+            kind = f"{prefix}overlays.0.transmittance" in state
+            if frames != here or kind != isinstance(self[0], GivenOverlay):
                 raise refuse(
-                    f"the checkpoint's overlays are (height, width, downscale) {frames or 'absent'}, this run's are "
-                    f"{here}; resume with the photos, camera-res-scale-factor and overlay options it was trained with"
+                    f"the checkpoint's overlays are {'given' if kind else 'learned'}, (height, width, downscale) "
+                    f"{frames or 'absent'}, this run's are {here}; resume with the photos, camera-res-scale-factor and "
+                    "overlay options it was trained with"
                 )
             return
         if frames and not wanted:

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from ssa_nerfstudio.errors import refuse
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 
 MIN_VIEWS = 2
 """An artifact is what does not change from view to view: one view cannot show it."""
@@ -36,6 +40,19 @@ def check_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoi
         raise refuse(f"--load-dir {load_dir} holds no {pattern}; give the nerfstudio_models folder of an earlier run")
 
 
+def check_settings(model: SSASplatfactoModelConfig, device: torch.device | str) -> None:
+    """Refuse settings of the model that contradict each other or the machine."""
+    if not model.sparsity_weight >= 0:
+        raise refuse(
+            f"--pipeline.model.sparsity-weight {model.sparsity_weight} must not be negative; 0.05 is the default"
+        )
+    if model.rasterizer == "reference" and model.use_absgrad and model.strategy == "adc":
+        raise refuse("--pipeline.model.rasterizer reference has no absgrad; add --pipeline.model.use-absgrad False")
+    needed = {"gsplat": "cuda", "cpu": "cpu"}.get(model.rasterizer)
+    if needed is not None and torch.device(device).type != needed:
+        raise refuse(f"--pipeline.model.rasterizer {model.rasterizer} does not run on {device}; use auto")
+
+
 def check_transforms(data: Path) -> None:
     """Refuse a nerfstudio dataset whose transforms.json is missing, unreadable, empty, or holds broken poses.
 
@@ -58,6 +75,8 @@ def check_transforms(data: Path) -> None:
     if len(frames) < MIN_VIEWS:
         raise refuse(f"{path} lists {len(frames)} photos; at least {MIN_VIEWS} are needed, 30 and more work well")
     for frame in frames:
+        if not isinstance(frame, dict):
+            raise refuse(f"{path}: the frame {frame!r} is no object with file_path and transform_matrix")
         name = frame.get("file_path", "a frame without file_path")
         matrix = np.array(frame.get("transform_matrix", []), dtype=object)
         try:
@@ -82,7 +101,10 @@ def check_views(outputs: DataparserOutputs, source: Path) -> None:
             f"{source} leaves {views} photos to train on; at least {MIN_VIEWS} are needed: "
             "add photos, or hold fewer back for evaluation"
         )
-    finite = torch.isfinite(outputs.cameras.camera_to_worlds).flatten(1).all(dim=1)
-    if not finite.all():
-        name = outputs.image_filenames[int((~finite).nonzero()[0])]
-        raise refuse(f"the pose of {name} is not finite; remove that photo from {source} or register it again")
+    cameras = outputs.cameras
+    intrinsics = torch.cat([t.reshape(views, -1) for t in (cameras.fx, cameras.fy, cameras.cx, cameras.cy)], dim=1)
+    for what, values in (("pose", cameras.camera_to_worlds), ("intrinsics", intrinsics)):
+        finite = torch.isfinite(values).flatten(1).all(dim=1)
+        if not finite.all():
+            name = outputs.image_filenames[int((~finite).nonzero()[0])]
+            raise refuse(f"{source}: the {what} of {name} are not finite numbers; correct them or remove that photo")

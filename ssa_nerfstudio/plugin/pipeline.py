@@ -18,7 +18,7 @@ from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.statistics import accumulate
 from ssa_nerfstudio.plugin.camera_groups import group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
-from ssa_nerfstudio.plugin.inputs import check_device, check_transforms, check_views
+from ssa_nerfstudio.plugin.inputs import check_device, check_settings, check_transforms, check_views
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 
 
@@ -50,6 +50,7 @@ class SSAPipeline(VanillaPipeline):
         grad_scaler: GradScaler | None = None,
     ) -> None:
         check_device(device)
+        check_settings(config.model, device)
         source = _source(config)
         if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
             check_transforms(source)

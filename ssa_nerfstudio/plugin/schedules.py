@@ -33,7 +33,8 @@ def scaled(config: SSATrainerConfig) -> SSATrainerConfig:
     factor = config.max_num_iterations / FULL_LENGTH
     model = config.pipeline.model
     for name in _MODEL_STEPS:
-        setattr(model, name, max(1, round(getattr(model, name) * factor)))
+        steps = getattr(model, name)
+        setattr(model, name, max(1, round(steps * factor)) if steps else 0)  # 0 switches a schedule off
     model.refine_every = max(SHORTEST_REFINEMENT, round(model.refine_every * factor))
     for entry in config.optimizers.values():
         scheduler = entry["scheduler"]

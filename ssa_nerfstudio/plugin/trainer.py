@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pickle import UnpicklingError
 
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.schedules import scaled
@@ -61,7 +63,14 @@ class SSATrainer(Trainer):
 
     def _load_checkpoint(self) -> None:
         check_checkpoint(self.config.load_dir, self.config.load_step, self.config.load_checkpoint)
-        super()._load_checkpoint()
+        try:
+            super()._load_checkpoint()
+        except (RuntimeError, OSError, EOFError, UnpicklingError) as error:
+            source = self.config.load_checkpoint or f"the newest checkpoint in {self.config.load_dir}"
+            reason = str(error).splitlines()[0]
+            raise refuse(
+                f"{source} cannot be read ({reason}); remove it or name an earlier one: --load-step"
+            ) from error
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""

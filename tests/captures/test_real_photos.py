@@ -39,7 +39,7 @@ def test_a_real_dashcam_trains_and_l1_keeps_its_constant_sky_out_of_the_overlay(
         config.optimizers["overlay"]["optimizer"].lr = 0.02
         _, pipeline, _ = train_and_evaluate(config)
         matte = pipeline.model.artifacts.learned()[0].matte().detach()[..., 0]
-        mask = undistorted_mask(data, matte.shape)
+        mask = undistorted_mask(data, (len(matte), matte.shape[1]))
         assert torch.isfinite(matte).all()
         upper[kind], bonnet[kind] = matte[: len(matte) // 3].mean(), matte[mask].mean()
     assert upper["l1"] < upper["off"] - 0.1, (upper, bonnet)
@@ -50,7 +50,8 @@ def undistorted_mask(data: Path, size: tuple[int, int]) -> torch.Tensor:
     """The approximate mask of the bonnet [H, W] in the frame that the model sees, at its resolution."""
     camera = json.loads((data / "transforms.json").read_text())
     distortion = tuple(camera.get(name, 0.0) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    lens = Lens(*(camera[name] for name in ("w", "h", "fl_x", "fl_y", "cx", "cy")), distortion)
+    width, height, fx, fy, cx, cy = (camera[name] for name in ("w", "h", "fl_x", "fl_y", "cx", "cy"))
+    lens = Lens(width, height, fx, fy, cx, cy, distortion)
     raw = np.asarray(Image.open(data / "artifact_mask_approx.png").convert("L"), np.float32) / 255
     straight = undistort(np.repeat(raw[..., None], 3, axis=2), lens)[..., 0]
     mask = F.interpolate(torch.from_numpy(straight)[None, None], size=size, mode="area")[0, 0]

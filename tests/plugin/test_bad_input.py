@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import edit_transforms
 
 from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
 from ssa_nerfstudio.errors import BadInput
@@ -134,6 +135,51 @@ def test_resuming_an_overlay_without_one_is_refused(tiny_scene, tmp_path, capsys
 
 def test_resuming_from_an_empty_folder_is_refused(tiny_scene, tmp_path, capsys):
     assert "holds no step-*.ckpt" in refusal(capsys, lambda: train(tiny_scene, tmp_path / "out", load_dir=tmp_path))
+
+
+def test_resuming_from_half_a_checkpoint_is_refused(tiny_scene, tmp_path, capsys):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+    _, _, path = train_and_evaluate(config)
+    checkpoint = next((path.parent / "nerfstudio_models").glob("*.ckpt"))
+    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
+    message = refusal(capsys, lambda: train(tiny_scene, tmp_path / "out", 4, load_dir=checkpoint.parent))
+    assert "cannot be read" in message
+    assert "--load-step" in message
+
+
+def test_resuming_a_learned_overlay_with_a_given_one_is_refused(tiny_scene, tmp_path, capsys):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+    _, _, path = train_and_evaluate(config)
+    layers = tmp_path / "layers.npz"
+    np.savez(layers, T=np.ones((48, 64, 3)), B=np.zeros((48, 64, 3)))
+    model = {"num_downscales": 0, "overlay": "given", "overlay_given": layers}
+    other = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, model)
+    other.load_dir = path.parent / "nerfstudio_models"
+    assert "are learned" in refusal(capsys, lambda: train_and_evaluate(other))
+
+
+@pytest.mark.parametrize(
+    ("model", "complaint"),
+    [
+        ({"sparsity_weight": -1.0}, "must not be negative"),
+        ({"rasterizer": "reference"}, "--pipeline.model.use-absgrad False"),
+        ({"rasterizer": "gsplat"}, "does not run on cpu"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(tiny_scene, tmp_path, capsys, model, complaint):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, model)
+    config.machine.device_type = "cpu"
+    assert complaint in refusal(capsys, lambda: train_and_evaluate(config))
+
+
+def test_a_focal_length_that_is_no_number_is_refused(broken_scene, tmp_path, capsys):
+    edit_transforms(broken_scene, fl_x=float("nan"))
+    assert "intrinsics of" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
+
+
+def test_frames_that_are_no_objects_are_refused(broken_scene, tmp_path, capsys):
+    edit_transforms(broken_scene, frames=["a", "b", "c"])
+    assert "the frame 'a'" in refusal(capsys, lambda: train(broken_scene, tmp_path / "out"))
 
 
 @pytest.mark.parametrize(

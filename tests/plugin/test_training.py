@@ -249,6 +249,7 @@ def test_the_papers_protocol_is_what_the_paper_says():
     assert (model.sparsity, model.sparsity_weight, model.ssim_lambda) == ("l1", 0.05, 0.2)
     assert (model.background_color, model.num_downscales, model.use_absgrad) == ("black", 0, False)
     assert (model.densify_grad_thresh, model.cull_alpha_thresh) == (2e-4, 0.005)
+    assert not model.ignore_background
     assert config.optimizers["overlay"]["optimizer"].lr == 5e-3
     assert config.optimizers["overlay"]["scheduler"] is None
 
