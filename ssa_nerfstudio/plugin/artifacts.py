@@ -74,19 +74,18 @@ class Artifacts(nn.Module):
         """
         count = len(state.get(f"{prefix}camera_keys", ()))
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
+        given = f"{prefix}overlays.0.transmittance" in state
         if len(self):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
-            kind = f"{prefix}overlays.0.transmittance" in state
-            if frames != here or kind != isinstance(self[0], GivenOverlay):
+            if frames != here or given != isinstance(self[0], GivenOverlay):
                 raise refuse(
-                    f"the checkpoint's overlays are {'given' if kind else 'learned'}, (height, width, downscale) "
+                    f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale) "
                     f"{frames or 'absent'}, this run's are {here}; resume with the photos, camera-res-scale-factor and "
                     "overlay options it was trained with"
                 )
             return
         if frames and not wanted:
             raise refuse("the checkpoint has an overlay and this run has none; resume with --pipeline.model.overlay on")
-        given = f"{prefix}overlays.0.transmittance" in state
         device = self.camera_keys.device
         self.overlays = nn.ModuleList(
             GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3)) if given else ScreenSpaceOverlay(h, w, resolution)
