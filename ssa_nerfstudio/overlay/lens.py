@@ -48,7 +48,8 @@ class Lens:
     @property
     def distorted(self) -> bool:
         """Whether nerfstudio warps photos of this lens at all."""
-        return any(self.distortion)
+        # In float32, as nerfstudio holds them.
+        return bool(np.any(np.asarray(self.distortion, dtype=np.float32)))
 
     @property
     def matrix(self) -> np.ndarray:
@@ -149,6 +150,9 @@ def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
         )
     if width < 1 or height < 1:
         raise ValueError(f"undistorting with {lens.distortion} leaves no pixel of {lens.width} x {lens.height}")
+    if not np.isfinite(matrix).all():
+        # A fisheye whose angle turns back within the frame: OpenCV answers with NaN.
+        raise ValueError(f"a lens with distortion {lens.distortion} folds its frame and cannot be undistorted")
     target = Lens(
         width=width,
         height=height,

@@ -42,6 +42,10 @@ def by_nerfstudio(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray
 
 def check_against_nerfstudio(image: np.ndarray, lens: Lens) -> None:
     matrix, warped = by_nerfstudio(image, lens)
+    if not np.isfinite(matrix).all() or not warped.size:
+        with pytest.raises(ValueError, match=r"folds its frame|leaves no pixel"):
+            undistort(image, lens)
+        return
     ours, target = undistort(image, lens), undistorted(lens)
     assert np.array_equal(ours, warped)
     assert ours.shape[:2] == (target.height, target.width)
@@ -82,6 +86,12 @@ def test_any_lens_comes_out_as_in_nerfstudio(size, focal, centre, coefficients, 
         lens = Lens(width, height, *focals, *middle, (k1, k2, 0, 0, p1, p2))
     if lens.distorted:
         check_against_nerfstudio(np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8), lens)
+
+
+def test_a_fisheye_that_folds_its_frame_is_refused():
+    lens = Lens(30, 30, 15.0, 14.55, 15.0, 15.0, (0.0, -0.125, 0.0, 0.0, 0.0, 0.0), "fisheye")
+    with pytest.raises(ValueError, match="folds its frame"):
+        undistorted(lens)
 
 
 def test_without_distortion_nothing_is_touched():
