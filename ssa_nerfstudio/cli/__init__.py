@@ -7,6 +7,7 @@ import sys
 
 COMMANDS = {
     "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
+    "process": "Make a nerfstudio dataset from photos or videos, with poses that a static artifact does not mislead.",
     "simulate": "Put an artifact in front of the training photos of a nerfstudio dataset.",
 }
 """Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""

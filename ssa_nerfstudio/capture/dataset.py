@@ -1,0 +1,85 @@
+"""A reconstruction as nerfstudio reads it: transforms.json and sparse_pc.ply, in ns-process-data's frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, saving a PNG aborts the process
+import pycolmap
+
+APPLIED_TRANSFORM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
+"""From COLMAP's world, whose first camera looks along z with y down, to nerfstudio's with z up, [3, 4]."""
+POINTS = "sparse_pc.ply"
+"""File of the points."""
+_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+
+
+def transforms(reconstruction: pycolmap.Reconstruction, sources: Mapping[str, str]) -> dict[str, Any]:
+    """transforms.json of the registered photos, without a split.
+
+    One camera is stated once, several with their frames. Poses are camera to world, OpenGL axes, as
+    `nerfstudio.process_data.colmap_utils.colmap_to_json` has them.
+
+    Args:
+        reconstruction: its cameras are of model OPENCV.
+        sources: for each photo the file it was.
+    """
+    cameras = {number: _intrinsics(camera) for number, camera in reconstruction.cameras.items()}
+    images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
+    seen = {image.camera_id for image in images}
+    shared = cameras[images[0].camera_id] if len(seen) == 1 else {}
+    frames = [
+        {
+            "file_path": f"images/{image.name}",
+            "transform_matrix": _pose(image).tolist(),
+            "source_name": sources[image.name],
+            **({} if shared else cameras[image.camera_id]),
+        }
+        for image in images
+    ]
+    return {
+        "camera_model": "OPENCV",
+        **shared,
+        "applied_transform": APPLIED_TRANSFORM.tolist(),
+        "ply_file_path": POINTS,
+        "frames": frames,
+    }
+
+
+def split(meta: dict[str, Any], train: Sequence[str], test: Sequence[str]) -> dict[str, Any]:
+    """transforms.json with a split: lists of the registered among the photos of two passes.
+
+    Args:
+        meta: transforms.json.
+        train, test: photos of the passes, files in images/.
+    """
+    registered = {frame["file_path"] for frame in meta["frames"]}
+    lists = [[path for path in (f"images/{name}" for name in names) if path in registered] for names in (train, test)]
+    return {**meta, "train_filenames": lists[0], "val_filenames": lists[1], "test_filenames": lists[1]}
+
+
+def write_points(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
+    """Stores the points in nerfstudio's world as binary PLY: float x, y, z and uchar red, green, blue."""
+    points = list(reconstruction.points3D.values())
+    table = np.empty(len(points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    if points:
+        table["xyz"] = np.array([point.xyz for point in points]) @ APPLIED_TRANSFORM[:, :3].T
+        table["rgb"] = np.array([point.color for point in points])
+    properties = [f"property float {axis}" for axis in "xyz"]
+    properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
+    path.write_bytes("\n".join(header).encode() + table.tobytes())
+
+
+def _pose(image: pycolmap.Image) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3] = image.cam_from_world().inverse().matrix()
+    pose[:3, 1:3] *= -1
+    return np.vstack([APPLIED_TRANSFORM, [0, 0, 0, 1]]) @ pose
+
+
+def _intrinsics(camera: pycolmap.Camera) -> dict[str, float]:
+    return {"w": camera.width, "h": camera.height, **dict(zip(_INTRINSICS, map(float, camera.params), strict=True))}
