@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 
 COMMANDS = {
     "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
     "process": "Make a nerfstudio dataset from photos or videos, with poses that a static artifact does not mislead.",
     "simulate": "Put an artifact in front of the training photos of a nerfstudio dataset.",
+    "export-overlay": "Write the artifact that a run learned as pictures and masks, and take it off photos.",
+    "export-splats": "Write a run's clean splats as PLY, as ns-export gaussian-splat does, and compressed.",
 }
 """Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""
 
@@ -35,6 +38,7 @@ def main(arguments: list[str] | None = None) -> None:
         raise refuse(f"there is no command {name!r}; choose one of {', '.join(COMMANDS)} (ssa --help)")
     import tyro
 
+    warnings.simplefilter("ignore", FutureWarning)  # libraries' own, at import: nothing that a user could act on
     command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
     tyro.cli(command, args=rest, prog=f"ssa {name}", description=COMMANDS[name]).run()
 

@@ -17,6 +17,7 @@ from ssa_nerfstudio.benchmark.run import Outcome, configure, train_and_evaluate,
 from ssa_nerfstudio.demo.scene import DemoScene
 from ssa_nerfstudio.effects.dashboard import Dashboard
 from ssa_nerfstudio.effects.watermark import Watermark
+from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 
 ARTIFACTS = {"dashboard": Dashboard, "watermark": Watermark}
@@ -117,16 +118,9 @@ def _pictures(pipelines: dict[str, SSAPipeline]) -> dict[str, np.ndarray]:
         "test photo": _image(batch["image"]),
         "splats, overlay off": _image(off.model.get_outputs_for_camera(camera)["rgb"]),
         "splats, ssa-splatfacto": _image(drawn["rgb"]),
-        "artifact learned": over_checkerboard(_image(drawn["overlay_rgb"]), _image(drawn["overlay_alpha"])),
+        "artifact learned": _image(over_checkerboard(drawn["overlay_rgb"], drawn["overlay_alpha"])),
         "matte": _image(drawn["overlay_alpha"].expand_as(drawn["rgb"])),
     }
-
-
-def over_checkerboard(color: np.ndarray, alpha: np.ndarray, side: int = 8) -> np.ndarray:
-    """A straight-alpha picture [H, W, 3] with matte [H, W, 1 or 3] over grey squares of `side` pixels."""
-    rows, columns = np.indices(color.shape[:2]) // side
-    board = np.where((rows + columns) % 2 == 0, 0.5, 0.35)[..., None]
-    return alpha * color + (1.0 - alpha) * board
 
 
 def _image(image: Tensor) -> np.ndarray:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
-from ssa_nerfstudio.plugin.camera_groups import match_camera, nearest_aspect
+from ssa_nerfstudio.plugin.camera_groups import LENS_VALUES, match_camera, nearest_aspect
 
 Overlay = ScreenSpaceOverlay | GivenOverlay
 
@@ -19,11 +19,14 @@ class Artifacts(nn.Module):
     """Overlays by camera group. Empty until `put` is called or a checkpoint makes room for its own."""
 
     camera_keys: Tensor
+    lenses: Tensor
+    """[G, LENS_VALUES], the raw cameras of the groups; empty where a checkpoint was written before they were kept."""
 
     def __init__(self) -> None:
         super().__init__()
         self.overlays = nn.ModuleList()
         self.register_buffer("camera_keys", torch.zeros(0, 6, dtype=torch.float64))
+        self.register_buffer("lenses", torch.zeros(0, LENS_VALUES, dtype=torch.float64))
         self._keys: list[list[float]] = []
         self._group_of_view: list[int] = []
 
@@ -35,17 +38,24 @@ class Artifacts(nn.Module):
         assert isinstance(overlay, ScreenSpaceOverlay | GivenOverlay)
         return overlay
 
-    def put(self, overlays: list[ScreenSpaceOverlay] | list[GivenOverlay], keys: Tensor, groups: list[int]) -> None:
+    def put(
+        self,
+        overlays: list[ScreenSpaceOverlay] | list[GivenOverlay],
+        keys: Tensor,
+        groups: list[int],
+        lenses: Tensor,
+    ) -> None:
         """Put artifacts in front of the scene.
 
         Args:
             overlays: one a camera group.
             keys: [G, 6], what the groups' cameras are (`camera_groups.group_cameras`).
             groups: each training view's group.
+            lenses: [G, LENS_VALUES], the groups' raw cameras (`camera_groups.describe_lenses`).
         """
         device = self.camera_keys.device
         self.overlays = nn.ModuleList(overlays).to(device)
-        self.camera_keys = keys.to(device)
+        self.camera_keys, self.lenses = keys.to(device), lenses.to(device)
         self._keys, self._group_of_view = keys.tolist(), groups
 
     def learned(self) -> list[ScreenSpaceOverlay]:
@@ -92,7 +102,11 @@ class Artifacts(nn.Module):
             for h, w, resolution in frames
         ).to(device)
         self.camera_keys = torch.zeros(count, 6, dtype=torch.float64, device=device)
+        self.lenses = torch.zeros(
+            len(state.get(f"{prefix}lenses", ())), LENS_VALUES, dtype=torch.float64, device=device
+        )
 
-    def _load_from_state_dict(self, *args, **kwargs) -> None:
-        super()._load_from_state_dict(*args, **kwargs)
+    def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
+        state_dict.setdefault(f"{prefix}lenses", self.lenses)  # checkpoints of the first version have none
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._keys = self.camera_keys.tolist()

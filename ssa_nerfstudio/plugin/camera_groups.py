@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.camera_groups import group_frames, same_intrinsics
+from ssa_nerfstudio.overlay.lens import Lens
+
+LENS_VALUES = 13
+"""width, height, fx, fy, cx, cy, k1, k2, k3, k4, p1, p2, and the number of nerfstudio's camera type."""
 
 
 def group_cameras(cameras: Cameras) -> tuple[Tensor, list[int]]:
@@ -38,6 +42,30 @@ def nearest_aspect(camera: Cameras, keys: list[list[float]]) -> int:
         if abs(width / height - key[0] / key[1]) < 0.01 * width / height:
             return g
     return 0
+
+
+def describe_lenses(cameras: Cameras) -> Tensor:
+    """Raw cameras, before nerfstudio undistorts their photos, for a checkpoint: [N, LENS_VALUES] float64 on the CPU."""
+    frames = describe(cameras)
+    distortion = cameras.distortion_params
+    if distortion is None:
+        distortion = torch.zeros(len(frames), 6)
+    kinds = cameras.camera_type.reshape(-1, 1)
+    return torch.cat([frames, distortion.reshape(-1, 6).to("cpu", torch.float64), kinds.to("cpu", torch.float64)], 1)
+
+
+def lens(described: list[float]) -> Lens:
+    """The lens of one row of `describe_lenses`.
+
+    Raises:
+        ValueError: nerfstudio knows no distortion for such a camera.
+    """
+    width, height, fx, fy, cx, cy, *distortion, kind = described
+    if kind == CameraType.FISHEYE.value:
+        return Lens(int(width), int(height), fx, fy, cx, cy, tuple(distortion), "fisheye")
+    if kind != CameraType.PERSPECTIVE.value and any(distortion):
+        raise ValueError(f"photos of camera type {CameraType(int(kind)).name} cannot be mapped back to their raw frame")
+    return Lens(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
 
 
 def describe(cameras: Cameras) -> Tensor:

@@ -88,7 +88,7 @@ class SSASplatfactoModel(SplatfactoModel):
         self.seed_points = points
         if points is not None and not self.config.random_init and len(points[1]):
             colors = points[1].float() / 255.0
-            dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-10)
+            dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-6)
             self.gauss_params["features_dc"] = Parameter(dc)
         self.artifacts = Artifacts()
         self.scene_scale = 1.0

@@ -16,7 +16,7 @@ from torch.cuda.amp.grad_scaler import GradScaler
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.statistics import accumulate
-from ssa_nerfstudio.plugin.camera_groups import group_cameras
+from ssa_nerfstudio.plugin.camera_groups import describe_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.inputs import check_device, check_settings, check_transforms, check_views
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
@@ -63,6 +63,7 @@ class SSAPipeline(VanillaPipeline):
                 self._set_overlays()
 
     def _set_overlays(self) -> None:
+        lenses = describe_lenses(self.datamanager.train_dataset.cameras)
         # Undistorts and crops the photos and rewrites the cameras: the overlay lives in what comes out.
         photos = self.datamanager.cached_train
         keys, groups = group_cameras(self.datamanager.train_dataset.cameras)
@@ -77,7 +78,8 @@ class SSAPipeline(VanillaPipeline):
                     views = ((photo["image"], photo.get("mask")) for photo in members)
                     label = f"Statistics of camera {g + 1} of {len(overlays)}"
                     overlay.start_from(accumulate(track(views, label, total=len(members), transient=True)))
-        self.model.artifacts.put(overlays, keys, groups)
+        first = [groups.index(g) for g in range(len(keys))]
+        self.model.artifacts.put(overlays, keys, groups, lenses[first])
 
 
 def _source(config: SSAPipelineConfig) -> Path:

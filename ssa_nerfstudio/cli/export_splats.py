@@ -1,0 +1,71 @@
+"""`ssa export-splats`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ssa_nerfstudio.errors import refuse
+
+
+@dataclass
+class Command:
+    """Write a run's clean splats as PLY: the bytes of `ns-export gaussian-splat`, without photos and much faster."""
+
+    load_config: Path
+    """The run's config.yml (ssa-splatfacto or splatfacto), wherever its folder is now; no photos or GPU are needed."""
+    output_dir: Path
+    """Folder to write into; made where missing."""
+    output_filename: str = "splat.ply"
+    """Name of the PLY file; an older one is replaced."""
+    ply_color_mode: Literal["sh_coeffs", "rgb"] = "sh_coeffs"
+    """Colours as spherical harmonics, or as 8-bit red, green and blue."""
+    compressed: bool = False
+    """Also write PlayCanvas' compressed PLY (about a quarter of the size, lossy) as NAME.compressed.ply."""
+    obb_center: tuple[float, float, float] | None = None
+    """Centre of a box outside of which nothing is exported; needs all three."""
+    obb_rotation: tuple[float, float, float] | None = None
+    """The box's roll, pitch and yaw, radians."""
+    obb_scale: tuple[float, float, float] | None = None
+    """The box's sizes."""
+    step: int | None = None
+    """Checkpoint to read; the newest where not given."""
+
+    def run(self) -> None:
+        """Read the checkpoint and write.
+
+        Raises:
+            BadInput: the arguments or the checkpoint cannot be worked with.
+        """
+        box = self.obb_center, self.obb_rotation, self.obb_scale
+        if any(box) and not all(box):
+            raise refuse("a box needs all of --obb-center, --obb-rotation and --obb-scale")
+        if Path(self.output_filename).name != self.output_filename or not self.output_filename.endswith(".ply"):
+            raise refuse(f"--output-filename {self.output_filename} must be the name of a .ply file, without folders")
+        from rich.console import Console
+
+        from ssa_nerfstudio.export.checkpoint import Checkpoint
+        from ssa_nerfstudio.export.splats import select, within, write_compressed_ply, write_ply
+
+        checkpoint = Checkpoint.read(self.load_config, self.step)
+        gaussians = checkpoint.gaussians()
+        inside = within(gaussians, *box) if all(box) else None  # pyright: ignore[reportArgumentType]
+        selection = select(gaussians, inside)
+        path = self.output_dir / self.output_filename
+        console = Console(highlight=False, soft_wrap=True)
+        try:
+            self.output_dir.mkdir(parents=True, exist_ok=True)
+            write_ply(path, gaussians, selection.kept, self.ply_color_mode)
+            paths = [path]
+            if self.compressed:
+                paths.append(path.with_suffix(".compressed.ply"))
+                write_compressed_ply(paths[1], gaussians, selection.kept)
+        except OSError as error:
+            raise refuse(f"{path} cannot be written ({error}); name another --output-dir") from error
+        for written in paths:
+            console.print(f"{written}: {selection.kept.sum():,} Gaussians, {written.stat().st_size / 1e6:,.1f} MB")
+        if selection.not_finite or selection.too_faint:
+            console.print(
+                f"Left out: {selection.too_faint:,} below an opacity of 1/255, {selection.not_finite:,} not finite."
+            )

@@ -1,0 +1,1 @@
+"""What a training learned, as files: the artifact as pictures, photos without it, and the splats."""

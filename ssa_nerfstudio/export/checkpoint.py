@@ -1,0 +1,93 @@
+"""A finished run, read from its checkpoint alone: no photo, no dataset and no GPU are needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.upstream import allow_checkpoint_scalars
+
+_MODEL = "_model."
+_MODELS_FOLDER = "nerfstudio_models"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The model of one checkpoint."""
+
+    path: Path
+    """The step-*.ckpt file."""
+    step: int
+    """Step after which it was written."""
+    model: dict[str, Any]
+    """The model's state dict."""
+
+    @staticmethod
+    def read(config: Path, step: int | None = None) -> Checkpoint:
+        """Read the checkpoint that stands beside a run's config.yml, wherever that folder has been moved.
+
+        Args:
+            config: the run's config.yml.
+            step: which checkpoint; the newest where None.
+
+        Raises:
+            BadInput: there is none, or it is no checkpoint of Gaussian splats.
+        """
+        if not config.is_file():
+            raise refuse(f"--load-config {config} does not exist; give the config.yml that ns-train wrote")
+        folder = config.parent / _MODELS_FOLDER
+        found = {_step(path): path for path in folder.glob("step-*.ckpt")}
+        if step is not None and step not in found:
+            there = ", ".join(map(str, sorted(found))) or "none"
+            raise refuse(f"{folder} has no checkpoint of step {step}; there are {there}")
+        if not found:
+            raise refuse(f"{folder} holds no step-*.ckpt; give --load-config the config.yml of a run that saved one")
+        path = found[max(found) if step is None else step]
+        allow_checkpoint_scalars()
+        try:
+            saved = torch.load(path, map_location="cpu", weights_only=True)
+            state = {name.removeprefix("module."): value for name, value in saved["pipeline"].items()}
+            at = int(saved["step"])
+        except (RuntimeError, OSError, EOFError, UnpicklingError, KeyError, TypeError, AttributeError) as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise refuse(f"{path} cannot be read as a checkpoint ({reason}); copy it again or train again") from error
+        model = {name.removeprefix(_MODEL): value for name, value in state.items() if name.startswith(_MODEL)}
+        if "gauss_params.means" not in model:
+            raise refuse(f"{path} holds no Gaussian splats; give a run of ssa-splatfacto or splatfacto")
+        return Checkpoint(path, at, model)
+
+    def gaussians(self) -> dict[str, Tensor]:
+        """Parameters of the N Gaussians: means [N, 3], scales [N, 3] (log), quats [N, 4] (w first), opacities [N, 1]
+        (logit), features_dc [N, 3], features_rest [N, K, 3]."""
+        prefix = "gauss_params."
+        return {name.removeprefix(prefix): v for name, v in self.model.items() if name.startswith(prefix)}
+
+    def artifacts(self) -> Artifacts:
+        """The overlays.
+
+        Raises:
+            BadInput: the run has none.
+        """
+        prefix = "artifacts."
+        if not len(self.model.get(f"{prefix}camera_keys", ())):
+            raise refuse(
+                f"{self.path} has no overlay: it was trained with --pipeline.model.overlay off or by another method; "
+                "train it with ssa-splatfacto"
+            )
+        artifacts = Artifacts().eval()
+        artifacts.make_room(self.model, prefix, wanted=True)
+        own = {name.removeprefix(prefix): v for name, v in self.model.items() if name.startswith(prefix)}
+        artifacts.load_state_dict(own)
+        return artifacts
+
+
+def _step(path: Path) -> int:
+    digits = path.stem.removeprefix("step-")
+    return int(digits) if digits.isdecimal() else -1

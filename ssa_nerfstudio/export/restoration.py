@@ -1,0 +1,137 @@
+"""Photos without their artifact, where it let light through: C = (I - B) / T, which is (I - A W) / (1 - A)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.export.layers import ArtifactLayers
+from ssa_nerfstudio.simulation.photos import UnusableFile, read_photo
+
+LEAST_TRANSMITTANCE = 0.05
+"""A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one grey level would become twenty."""
+SAME_ASPECT = 0.005
+"""Photos whose aspect differs by less than this, relatively, may be the trained ones at another resolution."""
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+"""Files of a folder that count as photos."""
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What became of one photo."""
+
+    path: Path
+    """Relative to the folder of photos."""
+    hidden: float
+    """Fraction of pixels behind a matte above 0.95: not recovered, black."""
+    implausible: float
+    """Fraction of recovered pixels that came out darker than black or brighter than white by over two grey levels."""
+
+
+def restore(photo: np.ndarray, layers: ArtifactLayers) -> tuple[np.ndarray, np.ndarray, float]:
+    """Take an artifact off a photo.
+
+    Args:
+        photo: uint8 [H, W, 3].
+        layers: of the photo's frame and size.
+
+    Returns:
+        The photo uint8 [H, W, 3], black where hidden; what could be recovered, bool [H, W]; and the fraction of it
+        that is implausible.
+    """
+    seen = layers.transmittance.min(axis=-1) >= LEAST_TRANSMITTANCE
+    scene = photo - np.float32(255) * layers.addition
+    scene /= np.maximum(layers.transmittance, np.float32(LEAST_TRANSMITTANCE))
+    wrong = ((scene < -2) | (scene > 257)).any(axis=-1) & seen
+    scene[~seen] = 0
+    return np.rint(scene).clip(0, 255).astype(np.uint8), seen, float(wrong.sum() / max(1, seen.sum()))
+
+
+def find_photos(folder: Path) -> list[Path]:
+    """The photos below a folder, sorted.
+
+    Raises:
+        BadInput: there are none.
+    """
+    if not folder.is_dir():
+        raise refuse(f"--apply {folder} is no folder; give the folder of the photos")
+    photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+    if not photos:
+        raise refuse(f"--apply {folder} holds no photos ({', '.join(sorted(SUFFIXES))}); give the folder of the photos")
+    return photos
+
+
+def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
+    """The layers of a photo's frame, at its size: of the same size first, else of the same aspect, enlarged.
+
+    Args:
+        path: the photo, of which only the header is read.
+        frames: layers to choose from, those of raw frames first.
+
+    Raises:
+        BadInput: the photo is unreadable or of another aspect.
+    """
+    try:
+        with Image.open(path) as image:
+            width, height = image.size
+    except (OSError, SyntaxError, ValueError) as error:
+        raise refuse(f"{path} cannot be read as a photo ({error}); copy it again or remove it") from error
+    for layers in frames:
+        if (layers.camera.width, layers.camera.height) == (width, height):
+            return layers
+    for layers in frames:
+        trained = layers.camera.width / layers.camera.height
+        if abs(width / height / trained - 1) < SAME_ASPECT:
+            return layers.sized(width, height)
+    sizes = ", ".join(f"{f.camera.width} x {f.camera.height} ({f.frame})" for f in frames)
+    raise refuse(
+        f"{path} is {width} x {height}, the overlay's frame {sizes}; give photos of the camera it was trained on"
+    )
+
+
+def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers], output: Path) -> Iterator[Recovery]:
+    """Take the artifact off photos and write them as PNG, each under its own name; `output/hidden` gets their masks.
+
+    Args:
+        folder: what the photos' places in `output` are relative to.
+        photos: from `find_photos`.
+        frames: layers to choose from, those of raw frames first.
+        output: folder to write into; `photos/` and, per size, `mask_white_is_scene_WxH.png` (black: not recovered).
+
+    Yields:
+        What became of each photo, in order.
+
+    Raises:
+        BadInput: a photo is unreadable or of another frame.
+    """
+    sized: dict[Path, ArtifactLayers] = {}
+    for path in photos:
+        layers = fitting(path, [*sized.values(), *frames])
+        sized[path] = layers
+        name = f"mask_white_is_scene_{layers.camera.width}x{layers.camera.height}.png"
+        if not (output / name).exists():
+            seen = layers.transmittance.min(axis=-1) >= LEAST_TRANSMITTANCE
+            output.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(seen.astype(np.uint8) * 255).save(output / name)
+
+    def one(path: Path) -> Recovery:
+        layers = sized[path]
+        try:
+            photo = read_photo(path, layers.camera.width, layers.camera.height)
+        except UnusableFile as error:
+            raise refuse(str(error)) from error
+        clean, seen, implausible = restore(photo, layers)
+        place = (output / "photos" / path.relative_to(folder)).with_suffix(".png")
+        place.parent.mkdir(parents=True, exist_ok=True)
+        cv2.imwrite(str(place), clean[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        return Recovery(path.relative_to(folder), float(1 - seen.mean()), implausible)
+
+    with ThreadPoolExecutor(2) as pool:
+        yield from pool.map(one, photos)

@@ -1,0 +1,334 @@
+"""The artifact as files: what was trained comes back, in the frame that was asked for, and off the photos."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from small_checkpoints import cameras, one_camera, write_run
+
+from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
+from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.effects.catalogue import effect_class
+from ssa_nerfstudio.effects.layers import Layers
+from ssa_nerfstudio.errors import BadInput
+from ssa_nerfstudio.export.overlay import FILES
+from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.lens import Lens, distort, undistorted
+from ssa_nerfstudio.simulation.corruption import undistorted_layers
+
+WIDTH, HEIGHT = 96, 64
+
+
+def draw(effect: str, width: int = WIDTH, height: int = HEIGHT) -> Layers:
+    layers = effect_class(effect)().layers(height, width, np.random.default_rng(0))
+    assert isinstance(layers, Layers)
+    return layers
+
+
+def given(layers: Layers) -> GivenOverlay:
+    return GivenOverlay(torch.from_numpy(layers.transmittance), torch.from_numpy(layers.addition))
+
+
+def learned(width: int = WIDTH, height: int = HEIGHT, seed: int = 0, resolution: int = 1) -> ScreenSpaceOverlay:
+    overlay = ScreenSpaceOverlay(height, width, resolution)
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        overlay.color_logits.normal_(0, 2, generator=generator)
+        overlay.alpha_logits.normal_(0, 3, generator=generator)
+    return overlay
+
+
+def export(config: Path, output: Path, *options: object) -> dict:
+    main(["export-overlay", "--load-config", str(config), "--output", str(output), *map(str, options)])
+    return json.loads((output / "overlay.json").read_text())
+
+
+def read_rgba(path: Path) -> np.ndarray:
+    """Straight RGBA in [0, 1]."""
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    return cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA) / {np.dtype("u1"): 255, np.dtype("u2"): 65535}[image.dtype]
+
+
+def laid_over(rgba: np.ndarray, photo: np.ndarray) -> np.ndarray:
+    """What a picture editor makes of it, in grey levels."""
+    alpha = rgba[..., 3:]
+    return 255 * alpha * rgba[..., :3] + (1 - alpha) * photo
+
+
+def photo(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    coarse = np.random.default_rng(seed).uniform(0, 255, (8, 8, 3)).astype(np.float32)
+    return cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC).clip(0, 255).round().astype(np.uint8)
+
+
+@pytest.mark.parametrize("effect", ["watermark", "ui", "dashboard", "mud", "dust", "vignette"])
+def test_a_given_artifact_comes_back_within_a_grey_level(tmp_path, effect):
+    layers = draw(effect)
+    export(write_run(tmp_path / "run", one_camera(given(layers))), tmp_path / "out")
+    truth = layers.apply(photo()).astype(float)
+    for name in ("overlay.png", "overlay_16bit.png"):
+        error = np.abs(laid_over(read_rgba(tmp_path / "out" / name), photo()) - truth)
+        assert error.mean() < 1
+        assert np.percentile(error, 99) < 2
+
+
+@pytest.mark.parametrize("resolution", [1, 2, 4])
+def test_every_file_shows_the_learned_overlay(tmp_path, resolution):
+    overlay = learned(resolution=resolution)
+    about = export(write_run(tmp_path / "run", one_camera(overlay)), tmp_path / "out", "--threshold", 0.3)
+    with torch.no_grad():
+        transmittance, addition = (layer.numpy() for layer in overlay.layers())
+    alpha = 1 - transmittance
+    eight, sixteen = (read_rgba(tmp_path / "out" / n) for n in ("overlay.png", "overlay_16bit.png"))
+    np.testing.assert_allclose(eight[..., 3:], alpha, atol=0.5 / 255 + 1e-6)
+    np.testing.assert_allclose(sixteen[..., 3:], alpha, atol=0.5 / 65535 + 1e-6)
+    np.testing.assert_allclose(sixteen[..., :3] * alpha, addition, atol=1e-4)
+    premultiplied = np.load(tmp_path / "out" / "overlay_premultiplied.npy")
+    np.testing.assert_allclose(premultiplied, np.concatenate([addition, alpha], -1), atol=1e-6)
+    matte = cv2.imread(str(tmp_path / "out" / "matte.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(matte / 65535, alpha[..., 0], atol=1e-4)
+    scene, artifact = (
+        cv2.imread(str(tmp_path / "out" / f"mask_white_is_{what}.png"), cv2.IMREAD_UNCHANGED)
+        for what in ("scene", "artifact")
+    )
+    np.testing.assert_array_equal(artifact, np.where(alpha[..., 0] > 0.3, 255, 0))
+    np.testing.assert_array_equal(scene, 255 - artifact)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {*FILES, "layers.npz", "overlay.json"}
+    assert about["cameras"][0]["covered_fraction"] == pytest.approx((alpha > 0.3).mean())
+    assert about["cameras"][0]["mean_matte"] == pytest.approx(alpha.mean(), rel=1e-5)
+
+
+def test_nerfstudio_and_colmap_keep_what_is_white(tmp_path):
+    from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
+
+    export(write_run(tmp_path / "run", one_camera(given(draw("dashboard")))), tmp_path / "out", "--raw-frame")
+    kept = get_image_mask_tensor_from_path(tmp_path / "out" / "mask_white_is_scene.png")[..., 0].numpy()
+    assert kept[:20].all()
+    assert not kept[-10:].any()
+
+
+def test_light_that_no_rgba_picture_can_hold_is_reported(tmp_path):
+    rain, mark = draw("rain"), draw("watermark")
+    lost = [
+        export(write_run(tmp_path / name, one_camera(given(layers))), tmp_path / f"out-{name}")["cameras"][0]
+        for name, layers in (("rain", rain), ("mark", mark))
+    ]
+    assert lost[0]["lost_in_rgba_grey_levels"] > 1
+    assert lost[1]["lost_in_rgba_grey_levels"] < 0.01
+
+
+def test_the_layers_can_be_given_to_another_training(tmp_path, tiny_scene):
+    config = write_run(tmp_path / "run", one_camera(learned(64, 48)))
+    export(config, tmp_path / "out")
+    model = {"num_downscales": 0, "overlay": "given", "overlay_given": tmp_path / "out" / "layers.npz"}
+    _, pipeline, _ = train_and_evaluate(configure("ssa-splatfacto", tiny_scene, tmp_path / "again", 1, model))
+    transmittance, _ = learned(64, 48).layers()
+    torch.testing.assert_close(pipeline.model.artifacts[0].layers()[0], transmittance.detach().expand(-1, -1, 3))
+
+
+def test_a_rig_gets_a_folder_for_each_camera(tmp_path):
+    lenses = [Lens(WIDTH, HEIGHT, 60, 60, 48, 32), Lens(48, 40, 60, 60, 24, 20)]
+    config = write_run(tmp_path / "run", cameras([(learned(), lenses[0]), (learned(48, 40, 1), lenses[1])]))
+    about = export(config, tmp_path / "out")
+    assert [camera["folder"] for camera in about["cameras"]] == ["camera_0", "camera_1"]
+    sizes = [Image.open(tmp_path / "out" / camera["folder"] / "overlay.png").size for camera in about["cameras"]]
+    assert sizes == [(WIDTH, HEIGHT), (48, 40)]
+    assert {"T0", "B0", "T1", "B1"} == set(np.load(tmp_path / "out" / "layers.npz").files)
+
+
+LENSES = {
+    "perspective": Lens(WIDTH, HEIGHT, 70, 71, 47, 33, (-0.2, 0.05, 0.0, 0.0, 1e-3, -1e-3)),
+    "fisheye": Lens(WIDTH, HEIGHT, 60, 60, 47, 33, (0.05, 0.01, 0.0, 0.0, 0.0, 0.0), "fisheye"),
+}
+
+
+@pytest.mark.parametrize("model", sorted(LENSES))
+def test_the_raw_frame_is_that_of_the_photos(tmp_path, model):
+    lens = LENSES[model]
+    raw = draw("watermark")
+    target = undistorted(lens)
+    inside = undistorted_layers(raw, lens)
+    config = write_run(tmp_path / "run", one_camera(given(inside), lens))
+    about = export(config, tmp_path / "out", "--raw-frame")["cameras"][0]
+    assert (about["frame"], about["intrinsics"]["width"], about["intrinsics"]["distortion"]) == (
+        "raw",
+        WIDTH,
+        list(lens.distortion),
+    )
+    known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > 0.999
+    error = np.abs(laid_over(read_rgba(tmp_path / "out" / "overlay.png"), photo()) - raw.apply(photo()))[known]
+    assert error.mean() < 2
+
+
+@pytest.mark.parametrize(("effect", "highest"), [("watermark", 12), ("dashboard", 40)])
+def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(captures, tmp_path, effect, highest):
+    t = json.loads((captures / "gopro_walk" / "transforms.json").read_text())
+    distortion = tuple(float(t.get(name, 0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    lens = Lens(t["w"], t["h"], t["fl_x"], t["fl_y"], t["cx"], t["cy"], distortion)
+    raw = draw(effect, lens.width, lens.height)
+    inside = undistorted_layers(raw, lens)
+    export(write_run(tmp_path / "run", one_camera(given(inside), lens)), tmp_path / "out", "--raw-frame")
+    clean = np.asarray(Image.open(captures / "gopro_walk" / t["frames"][10]["file_path"]).convert("RGB"))
+    target = undistorted(lens)
+    known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > 0.999
+    error = np.abs(laid_over(read_rgba(tmp_path / "out" / "overlay.png"), clean) - raw.apply(clean))[known]
+    print(f"{effect}: mean {error.mean():.3f}, 99th percentile {np.percentile(error, 99):.2f} grey levels")
+    assert error.mean() < 2
+    assert np.percentile(error, 99) < highest
+
+
+def test_a_training_keeps_its_lens_in_the_checkpoint(broken_scene, tmp_path):
+    from conftest import edit_transforms
+
+    edit_transforms(broken_scene, k1=-0.1, k2=0.02)
+    _, pipeline, config = train_and_evaluate(configure("ssa-splatfacto", broken_scene, tmp_path, 1))
+    overlay = pipeline.model.artifacts[0]
+    assert (overlay.height, overlay.width) != (48, 64)
+    about = export(config, tmp_path / "out", "--raw-frame")["cameras"][0]
+    assert Image.open(tmp_path / "out" / "overlay.png").size == (64, 48)
+    assert about["intrinsics"]["distortion"][:2] == pytest.approx([-0.1, 0.02])
+
+
+def old_run(folder: Path) -> Path:
+    """A checkpoint of the first version, which kept no lenses."""
+    config = write_run(folder, one_camera(learned()))
+    path = next((folder / "nerfstudio_models").iterdir())
+    saved = torch.load(path, weights_only=True)
+    del saved["pipeline"]["_model.artifacts.lenses"]
+    torch.save(saved, path)
+    return config
+
+
+def test_a_checkpoint_without_lenses_is_still_read(tmp_path, capsys):
+    export(old_run(tmp_path / "run"), tmp_path / "out")
+    with pytest.raises(BadInput):
+        export(old_run(tmp_path / "run"), tmp_path / "raw", "--raw-frame")
+    assert "leave out --raw-frame" in capsys.readouterr().err
+    assert not (tmp_path / "raw").exists()
+
+
+def test_photos_lose_a_watermark_and_keep_the_rest(tmp_path, capsys):
+    layers = draw("watermark")
+    (tmp_path / "photos" / "day 1").mkdir(parents=True)
+    truth = photo(1)
+    Image.fromarray(layers.apply(truth)).save(tmp_path / "photos" / "day 1" / "a.png")
+    config = write_run(tmp_path / "run", one_camera(given(layers)))
+    export(config, tmp_path / "out", "--apply", tmp_path / "photos")
+    restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "day 1" / "a.png")).astype(int)
+    # One rounding, divided by a transmittance of 0.6.
+    assert np.abs(restored - truth).max() <= 2
+    assert "0.0% of their pixels" in capsys.readouterr().out
+
+
+def test_what_an_opaque_artifact_hides_is_black_and_counted(tmp_path, capsys):
+    layers = draw("dashboard")
+    (tmp_path / "photos").mkdir()
+    truth = photo(2)
+    Image.fromarray(layers.apply(truth)).save(tmp_path / "photos" / "a.png")
+    config = write_run(tmp_path / "run", one_camera(given(layers)))
+    export(config, tmp_path / "out", "--apply", tmp_path / "photos")
+    restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
+    hidden = layers.transmittance.min(axis=-1) < 0.05
+    assert not restored[hidden].any()
+    clear = layers.transmittance.min(axis=-1) > 0.9
+    assert np.abs(restored - truth)[clear].max() <= 1
+    mask = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png"))
+    np.testing.assert_array_equal(mask == 0, hidden)
+    assert f"{hidden.mean():.1%} of their pixels" in capsys.readouterr().out
+
+
+def test_original_photos_of_twice_the_size_are_restored(tmp_path):
+    large = draw("watermark", 2 * WIDTH, 2 * HEIGHT)
+    small = Layers(
+        *(cv2.resize(p, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for p in (large.transmittance, large.addition))
+    )
+    (tmp_path / "photos").mkdir()
+    truth = photo(3, 2 * WIDTH, 2 * HEIGHT)
+    Image.fromarray(large.apply(truth)).save(tmp_path / "photos" / "a.png")
+    export(write_run(tmp_path / "run", one_camera(given(small))), tmp_path / "out", "--apply", tmp_path / "photos")
+    restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
+    before = np.abs(large.apply(truth).astype(int) - truth).mean()
+    assert np.abs(restored - truth).mean() < 0.35 * before
+
+
+def test_photos_of_a_rig_need_to_know_their_camera(tmp_path, capsys):
+    lenses = [Lens(WIDTH, HEIGHT, 60, 60, 48, 32), Lens(WIDTH, HEIGHT, 80, 80, 48, 32)]
+    marks = [draw("watermark"), draw("ui")]
+    pairs = [(given(layers), lens) for layers, lens in zip(marks, lenses, strict=True)]
+    config = write_run(tmp_path / "run", cameras(pairs))
+    (tmp_path / "photos").mkdir()
+    Image.fromarray(marks[1].apply(photo())).save(tmp_path / "photos" / "a.png")
+    with pytest.raises(BadInput):
+        export(config, tmp_path / "out", "--apply", tmp_path / "photos")
+    assert "--camera 0 to 1" in capsys.readouterr().err
+    export(config, tmp_path / "out", "--apply", tmp_path / "photos", "--camera", 1)
+    restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
+    seen = marks[1].transmittance.min(axis=-1) > 0.3
+    assert np.abs(restored - photo())[seen].max() <= 3
+
+
+def spoil_nothing(tmp_path: Path) -> list[object]:
+    (tmp_path / "empty").mkdir()
+    return ["--apply", tmp_path / "empty"]
+
+
+def spoil_size(tmp_path: Path) -> list[object]:
+    (tmp_path / "photos").mkdir()
+    Image.fromarray(photo(0, 50, 50)).save(tmp_path / "photos" / "a.png")
+    return ["--apply", tmp_path / "photos"]
+
+
+def spoil_photo(tmp_path: Path) -> list[object]:
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "a.jpg").write_text("no photo")
+    return ["--apply", tmp_path / "photos"]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (lambda folder: ["--threshold", 1.5], "--threshold must be in (0, 1)"),
+        (lambda folder: ["--camera", 0], "add --apply PHOTOS"),
+        (lambda folder: ["--step", 77], "no checkpoint of step 77; there are 9"),
+        (lambda folder: ["--apply", folder / "nowhere"], "is no folder"),
+        (spoil_nothing, "holds no photos"),
+        (spoil_size, "a.png is 50 x 50"),
+        (spoil_photo, "a.jpg cannot be read as a photo"),
+    ],
+)
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(tmp_path, capsys, options, complaint):
+    config = write_run(tmp_path / "run", one_camera(learned()))
+    with pytest.raises(BadInput) as caught:
+        export(config, tmp_path / "out", *options(tmp_path))
+    assert caught.value.code == 2
+    assert complaint in capsys.readouterr().err
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith((".", "out"))) == []
+
+
+def test_foreign_and_broken_checkpoints_are_refused(tmp_path, capsys):
+    for name, complaint in (
+        ("nowhere", "does not exist"),
+        ("empty", "holds no step-*.ckpt"),
+        ("broken", "cannot be read as a checkpoint"),
+        ("nerf", "holds no Gaussian splats"),
+        ("plain", "has no overlay"),
+    ):
+        config = write_run(tmp_path / name, None)
+        path = next((tmp_path / name / "nerfstudio_models").iterdir())
+        if name == "nowhere":
+            config.unlink()
+        elif name == "empty":
+            path.unlink()
+        elif name == "broken":
+            path.write_bytes(path.read_bytes()[:500])
+        elif name == "nerf":
+            torch.save({"step": 1, "pipeline": {"_model.field.weight": torch.zeros(2)}}, path)
+        with pytest.raises(BadInput):
+            export(config, tmp_path / "out")
+        assert complaint in capsys.readouterr().err
