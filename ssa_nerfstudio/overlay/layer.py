@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.overlay.detection import static_area
 from ssa_nerfstudio.overlay.resampling import (
     letterbox,
     reduced_size,
@@ -89,7 +90,9 @@ class ScreenSpaceOverlay(nn.Module):
 
     @torch.no_grad()
     def start_from(self, statistics: ImageStatistics) -> None:
-        """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05); sigma also weighs the sparsity.
+        """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05).
+
+        The weight of the sparsity is made of two things: sigma, and where detection sees static edges.
 
         Raises:
             ValueError: where the statistics are of another frame.
@@ -100,7 +103,7 @@ class ScreenSpaceOverlay(nn.Module):
         # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the
         # pixel, is 1, and its mean colour would be lost.
         alpha = torch.exp(-deviation / STATISTICS_SCALE)
-        pair = torch.cat([alpha, alpha * mean, deviation], dim=-1)
+        pair = torch.cat([alpha, alpha * mean, deviation, static_area(statistics).to(alpha)[..., None]], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
             padded = nn.functional.pad(
@@ -112,7 +115,7 @@ class ScreenSpaceOverlay(nn.Module):
         alpha = pair[..., :1]
         self.color_logits.copy_((pair[..., 1:4] / alpha).clamp(*COLOR_START_RANGE).logit())
         self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
-        self.evidence.copy_(_evidence(pair[..., 4:]))
+        self.evidence.copy_(_evidence(pair[..., 4:5], pair[..., 5:]))
 
     def color(self) -> Tensor:
         """W: straight colour [h, w, 3] in (0, 1)."""
@@ -176,9 +179,15 @@ def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) 
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
 
 
-def _evidence(deviation: Tensor) -> Tensor:
-    """r = min(1, sigma / 70th percentile of sigma): near 0 where the views agree, so that sparsity spares the pixel."""
+def _evidence(deviation: Tensor, area: Tensor) -> Tensor:
+    """r: how much the sparsity weighs on a pixel, 1 outside the area of an artifact (its share of the pixel).
+
+    Inside, r = min(1, sigma / 70th percentile of sigma), near 0 where the views agree, so that sparsity spares what an
+    artifact hides. A sky agrees with itself, too; but no static edges enclose it, and there sparsity weighs in full.
+    """
     values = deviation.flatten().float()
     rank = max(1, round(0.7 * values.numel()))
     reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
-    return torch.ones_like(deviation) if reference <= 0 else (deviation / reference).clamp_max(1.0)
+    if reference <= 0:
+        return torch.ones_like(deviation)
+    return 1 - area * (1 - (deviation / reference).clamp_max(1.0))

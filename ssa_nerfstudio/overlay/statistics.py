@@ -7,6 +7,8 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.overlay.brightness import BrightnessBlocks
+
 _FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
 
 
@@ -14,8 +16,12 @@ class ImageStatistics:
     """Per-pixel mean and standard deviation of images of one size; memory does not depend on how many there are.
 
     Integer images are summed in int64, which is exact; in float32, E[x^2] - E[x]^2 would cancel at the deviations of
-    0.05 that matter here. Floating-point images are summed in float64.
+    0.05 that matter here. Floating-point images are summed in float64. The same pass keeps the brightness of blocks of
+    neighbouring views, on which detection is built.
     """
+
+    brightness: BrightnessBlocks
+    """Views in the order in which they came."""
 
     def __init__(self) -> None:
         self._sum: Tensor | None = None
@@ -42,12 +48,14 @@ class ImageStatistics:
             self._sum = torch.zeros(image.shape, dtype=torch.int64 if exact else torch.float64, device=image.device)
             self._squares = torch.zeros_like(self._sum)
             self._views = torch.zeros(*image.shape[:2], 1, dtype=torch.int64, device=image.device)
+            self.brightness = BrightnessBlocks(*image.shape[:2], device=image.device)
         if image.shape != self._sum.shape or image.dtype != self._dtype:
             raise ValueError(
                 f"image of {tuple(image.shape[:2])} {image.dtype} among images of {self.size} {self._dtype}"
             )
         # uint8 fits into int32 when squared, at half the memory traffic of int64.
         values = image.to(torch.int32 if image.dtype == torch.uint8 else self._sum.dtype)
+        seen = None
         if mask is None:
             self._views += 1
         else:
@@ -56,6 +64,7 @@ class ImageStatistics:
             values = torch.where(seen, values, torch.zeros_like(values))
         self._sum += values
         self._squares += values * values
+        self.brightness.add(values, seen)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -67,6 +76,11 @@ class ImageStatistics:
         if self._sum is None:
             raise ValueError("no image has been added")
         return self._sum.shape[0], self._sum.shape[1]
+
+    @property
+    def scale(self) -> float:
+        """What white is in the images: 255, 65535 or 1."""
+        return self._scale
 
     @property
     def views(self) -> Tensor:
