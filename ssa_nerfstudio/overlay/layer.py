@@ -5,6 +5,8 @@ Source: the paper, section "Modeling screen-space artifacts".
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -24,6 +26,12 @@ CONSTANT_START = (0.5, 0.1)
 """Colour and matte of the paper's ablation "constant start"."""
 MATTE_START_RANGE = (0.01, 0.99)
 """The starting matte is clamped to this before the logit: exp(-sigma / s) is exactly 1 where sigma is 0."""
+MATTE_LOGIT_RANGE = (-12.0, math.log(0.999 / 0.001))
+"""While it learns, the matte stays between 6e-6 and 0.999: beyond, the sigmoid is flat and a pixel never comes back,
+and the scene behind an opaque pixel would lose all gradient. 0.999 is 255 in a file of 8 bits, and gsplat's largest
+alpha of one Gaussian. A given artifact has no such range."""
+COLOR_LOGIT_RANGE = (-12.0, 12.0)
+"""While it learns, the colour stays between 6e-6 and 1 - 6e-6, for the same reason."""
 COLOR_START_RANGE = (1 / 510, 1 - 1 / 510)
 """The starting colour is clamped to this before the logit: half a grey level from black and white."""
 
@@ -116,6 +124,12 @@ class ScreenSpaceOverlay(nn.Module):
         self.color_logits.copy_((pair[..., 1:4] / alpha).clamp(*COLOR_START_RANGE).logit())
         self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
         self.evidence.copy_(_evidence(pair[..., 4:5], pair[..., 5:]))
+
+    @torch.no_grad()
+    def keep_in_range(self) -> None:
+        """Clamp the parameters to where a gradient can still move them (`MATTE_LOGIT_RANGE`, `COLOR_LOGIT_RANGE`)."""
+        self.alpha_logits.clamp_(*MATTE_LOGIT_RANGE)
+        self.color_logits.clamp_(*COLOR_LOGIT_RANGE)
 
     def color(self) -> Tensor:
         """W: straight colour [h, w, 3] in (0, 1)."""

@@ -6,12 +6,15 @@ that `SplatfactoModel` passes, and have `absgrad`, so that the model does not kn
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from torch import Tensor
+
+from ssa_nerfstudio.plugin.guards import bury_broken
 
 
 @dataclass
@@ -21,6 +24,9 @@ class AdaptiveDensityControl(DefaultStrategy):
     gsplat 1.4.0 resets opacities at step 0 too (`step % reset_every == 0`). Here that reset is left out: it exists to
     expose floaters, of which there are none before the first step, and the original implementation has none either.
     """
+
+    guarded: bool = True
+    """Leave skipped steps out of the statistics, remove Gaussians that are not finite, and never remove the last."""
 
     def step_post_backward(
         self,
@@ -54,11 +60,26 @@ class AdaptiveDensityControl(DefaultStrategy):
         half = 0.5 * info["n_cameras"]
         norms = torch.hypot(gradients[..., 0] * (half * info["width"]), gradients[..., 1] * (half * info["height"]))
         visible = info["radii"] > 0  # [C, N]
+        if self.guarded and info.get("skipped") is not None:
+            visible = visible & (info["skipped"] == 0)
         state["grad2d"] += torch.where(visible, norms, torch.zeros_like(norms)).sum(dim=0)
         state["count"] += visible.sum(dim=0)
         if self.refine_scale2d_stop_iter > 0:
-            radii = info["radii"].amax(dim=0) / float(max(info["width"], info["height"]))
+            radii = (info["radii"] * visible).amax(dim=0) / float(max(info["width"], info["height"]))
             torch.maximum(state["radii"], radii, out=state["radii"])
+
+    @torch.no_grad()
+    def _prune_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any], step: int):
+        """Remove what is transparent, too large or not finite, unless nothing would be left to go on with."""
+        if self.guarded:
+            bury_broken(params)
+            sizes = torch.exp(params["scales"]).amax(dim=-1)
+            stays = torch.sigmoid(params["opacities"].flatten()) >= self.prune_opa
+            if step > self.reset_every:
+                stays &= sizes <= self.prune_scale3d * state["scene_scale"]
+            if not stays.any():
+                return 0
+        return super()._prune_gs(params, optimizers, state, step)
 
 
 @dataclass
@@ -67,6 +88,8 @@ class MarkovChainMonteCarlo(MCMCStrategy):
 
     absgrad: bool = False
     """MCMC reads no gradients of the centres; a field because the render call asks for it."""
+    guarded: bool = True
+    """Relocate Gaussians that are not finite, and go on where nobody is alive; skipped steps perturb nothing."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of the strategy; the scene's scale plays no part in it."""
@@ -83,4 +106,24 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     ) -> None:
         """Relocate, add and perturb; the noise follows the current learning rate of the means."""
         lr = optimizers["means"].param_groups[0]["lr"]
+        if self.guarded and info.get("skipped") is not None:
+            lr = lr * (1.0 - info["skipped"])
         super().step_post_backward(params, optimizers, state, step, info, lr=lr)
+
+    @torch.no_grad()
+    def _relocate_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], binoms: Tensor) -> int:
+        """Move the dead to the living. Where nobody lives, wake everybody: gsplat would draw from nothing and fail.
+
+        A Gaussian of less than 1/255 is never drawn and gets no gradient, so a dead scene would stay dead.
+        """
+        if self.guarded:
+            broken = bury_broken(params)
+            opacities = params["opacities"]
+            if not (torch.sigmoid(opacities) > self.min_opacity).any():
+                awake = math.log(2 * self.min_opacity / (1 - 2 * self.min_opacity))
+                opacities.masked_fill_(~broken[:, None], awake)
+                for key, moment in optimizers["opacities"].state[opacities].items():
+                    if key != "step":
+                        moment.zero_()
+                return 0
+        return super()._relocate_gs(params, optimizers, binoms)

@@ -14,9 +14,11 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from ssa_nerfstudio import metrics
+from ssa_nerfstudio.errors import warn
 from ssa_nerfstudio.overlay.layer import composite, composite_over_splats
 from ssa_nerfstudio.overlay.losses import Sparsity, photometric, sparsity
 from ssa_nerfstudio.overlay.resampling import straight_color
+from ssa_nerfstudio.plugin import guards
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.cameras import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
@@ -63,6 +65,12 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     paper) instead of the normalised scene (splatfacto)."""
     pause_after_reset: int | None = None
     """ADC: steps without refinement after an opacity reset; None: one a photo and a refinement's (splatfacto)."""
+    guards: bool = True
+    """Skip steps whose loss or gradients are not finite, keep sizes of Gaussians in [1e-8, 1e4] world units and the
+    learned matte in [6e-6, 0.999], revive a scene of which no Gaussian is alive, drop start points inside a camera.
+    (A checkpoint with values that are not finite is refused in any case.)"""
+    max_skipped_steps: int = 100
+    """Guards: so many skipped steps in a row end the training; looked at every 100 steps."""
     rasterizer: RasterizerName = "auto"
     """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""
 
@@ -78,7 +86,7 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Build splatfacto's Gaussians without CUDA and without downloads, then what is ours."""
-        points = self.seed_points
+        points = self.seed_points = guards.usable_points(self.seed_points)
         if points is not None:
             # Upstream moves seed colours to CUDA (splatfacto.py:261); given none, it starts from random ones.
             self.seed_points = (points[0], points[1][:0])
@@ -86,6 +94,7 @@ class SSASplatfactoModel(SplatfactoModel):
             super().populate_modules()
         del self.lpips
         self.seed_points = points
+        guards.give_sizes_to_points_without(self.scales.data)
         if points is not None and not self.config.random_init and len(points[1]):
             colors = points[1].float() / 255.0
             dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-6)
@@ -107,12 +116,15 @@ class SSASplatfactoModel(SplatfactoModel):
                 refine_start_iter=config.warmup_length,
                 refine_stop_iter=config.mcmc_stop_at,
                 refine_every=config.refine_every,
+                guarded=config.guards,
             )
             with torch.no_grad():
                 self.opacities.fill_(torch.tensor(config.mcmc_opacity_start).logit())
                 self.scales.add_(torch.tensor(config.mcmc_scale_start).log())
         else:
-            self.strategy = AdaptiveDensityControl(**{**vars(self.strategy), "verbose": False})
+            self.strategy = AdaptiveDensityControl(
+                **{**vars(self.strategy), "verbose": False, "guarded": config.guards}
+            )
             if config.pause_after_reset is not None:
                 self.strategy.pause_refine_after_reset = config.pause_after_reset
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
@@ -122,6 +134,32 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.config.scale_by_extent:
             self.scene_scale = extent
             self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
+
+    def k_nearest_sklearn(self, x: Tensor, k: int):
+        """Distances to, and indices of, the k nearest neighbours of points [N, 3]; of fewer where N is too small."""
+        return super().k_nearest_sklearn(x, min(k, len(x) - 1))
+
+    def start_outside_cameras(self, positions: Tensor) -> None:
+        """Leave out start points that are inside a camera at positions [V, 3]. Before the optimisers are built."""
+        outside = guards.outside_cameras(self.means.data, positions)
+        if not self.config.guards or outside.all():
+            return
+        if not outside.any():
+            warn(
+                f"every start point is within {guards.START_DISTANCE} of a camera, nearer than any is drawn: the scene "
+                "is too small; leave --pipeline.datamanager.dataparser.auto-scale-poses True"
+            )
+            return
+        for name, values in self.gauss_params.items():
+            self.gauss_params[name] = Parameter(values.data[outside])
+
+    def step_post_backward(self, step: int) -> None:
+        """After the optimisers' step: bring parameters back into their range, then densify."""
+        if self.config.guards:
+            guards.keep_scales_in_range(self.scales)
+            for overlay in self.artifacts.learned():
+                overlay.keep_in_range()
+        super().step_post_backward(step)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.

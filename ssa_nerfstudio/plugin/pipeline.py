@@ -39,6 +39,7 @@ class SSAPipeline(VanillaPipeline):
     config: SSAPipelineConfig
     datamanager: SSADatamanager
     model: SSASplatfactoModel
+    loss: torch.Tensor
 
     def __init__(
         self,
@@ -58,9 +59,17 @@ class SSAPipeline(VanillaPipeline):
         check_views(self.datamanager.train_dataparser_outputs, source)
         if test_mode == "val":
             cameras = self.datamanager.train_dataset.cameras
-            self.model.set_scene_extent(_extent(cameras.camera_to_worlds[:, :3, 3]))
+            positions = cameras.camera_to_worlds[:, :3, 3]
+            self.model.set_scene_extent(_extent(positions))
+            self.model.start_outside_cameras(positions)
             if config.model.overlay != "off":
                 self._set_overlays()
+
+    def get_train_loss_dict(self, step: int):
+        """Upstream's, with the whole loss kept for the guard that reads it before the optimisers step."""
+        outputs, losses, metrics = super().get_train_loss_dict(step)
+        self.loss = torch.stack([loss.detach() for loss in losses.values()]).sum()
+        return outputs, losses, metrics
 
     def _set_overlays(self) -> None:
         lenses = describe_lenses(self.datamanager.train_dataset.cameras)

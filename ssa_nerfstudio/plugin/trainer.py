@@ -8,9 +8,12 @@ from pickle import UnpicklingError
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
+from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import give_up, refuse, warn
+from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, step_of, written_whole
+from ssa_nerfstudio.plugin.guards import READ_EVERY, GuardedOptimizers, StepGuard, first_not_finite
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.schedules import scaled
@@ -44,6 +47,7 @@ class SSATrainer(Trainer):
 
     config: SSATrainerConfig
     pipeline: SSAPipeline
+    guard: StepGuard | None = None
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         check_device(config.machine.device_type)
@@ -59,22 +63,82 @@ class SSATrainer(Trainer):
             means = self.config.optimizers["means"]
             means["optimizer"].lr *= scale
             means["scheduler"].lr_final *= scale
-        return super().setup_optimizers()
+        if not self.config.pipeline.model.guards:
+            return super().setup_optimizers()
+        self.guard = StepGuard(self.config.pipeline.model.max_skipped_steps)
+        groups = self.pipeline.get_param_groups()
+        return GuardedOptimizers(self.config.optimizers.copy(), groups, self.guard, lambda: self.pipeline.loss)
 
     def _load_checkpoint(self) -> None:
-        check_checkpoint(self.config.load_dir, self.config.load_step, self.config.load_checkpoint)
+        """Resume as upstream does; without --load-step from the newest checkpoint that is whole, saying which."""
+        folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
+        check_checkpoint(folder, step, file)
+        if folder is None and file is None:
+            super()._load_checkpoint()
+            return
+        if folder is None or step is not None:
+            error = self._load_one()
+            if error is not None:
+                raise refuse(f"{file or folder} cannot be read ({error}); name another checkpoint: --load-step")
+            return
+        candidates = newest_first(folder)
+        for candidate in candidates:
+            self.config.load_step = step_of(candidate)
+            error = damage(candidate) or self._load_one()
+            if error is None:
+                if candidate != candidates[0]:
+                    warn(f"resuming from {candidate}, the newest checkpoint that is whole")
+                self.config.load_step = None
+                return
+            warn(f"{candidate} cannot be used ({error})")
+        raise refuse(f"{folder} holds no checkpoint that can be read; give the folder of another run, or train anew")
+
+    def _load_one(self) -> str | None:
+        """Load what the configuration names; what is wrong with it, if anything is."""
         try:
             super()._load_checkpoint()
-        except (RuntimeError, OSError, EOFError, UnpicklingError) as error:
-            source = self.config.load_checkpoint or f"the newest checkpoint in {self.config.load_dir}"
-            reason = str(error).splitlines()[0]
-            raise refuse(
-                f"{source} cannot be read ({reason}); remove it or name an earlier one: --load-step"
+        except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError) as error:
+            return (str(error) or type(error).__name__).splitlines()[0]
+        broken = first_not_finite(self.pipeline.state_dict())
+        return None if broken is None else f"its {broken} holds values that are not finite"
+
+    @check_main_thread
+    def save_checkpoint(self, step: int) -> None:
+        """Write a checkpoint, whole and finite or not at all; older ones go only when it is there."""
+        if self.guard is not None:
+            self.guard.look(step)
+        states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
+        broken = first_not_finite({**self.pipeline.state_dict(), **states})
+        if broken is not None:
+            raise give_up(
+                f"training stopped at step {step}: {broken} holds values that are not finite, so no checkpoint was "
+                f"written; resume from an earlier one: --load-dir {self.checkpoint_dir}"
+            )
+        folder = self.checkpoint_dir
+        try:
+            with written_whole(folder) as self.checkpoint_dir:
+                super().save_checkpoint(step)
+        except (OSError, RuntimeError) as error:
+            earlier = newest_first(folder)
+            remedy = f"resume from {earlier[0]}: --load-dir {folder}" if earlier else "train anew"
+            raise give_up(
+                f"the checkpoint of step {step} could not be written to {folder} ({str(error).splitlines()[0]}); make "
+                f"room on the disk and {remedy}"
             ) from error
+        finally:
+            self.checkpoint_dir = folder
+        if self.config.save_only_latest_checkpoint:
+            for path in newest_first(folder):
+                if step_of(path) != step:
+                    path.unlink()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""
         loss, losses, metrics = super().train_iteration(step)
+        if self.guard is not None:
+            self.pipeline.model.info["skipped"] = self.guard.skipped
+            if (step + 1) % READ_EVERY == 0:
+                self.guard.look(step)
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:

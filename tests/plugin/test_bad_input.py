@@ -137,14 +137,15 @@ def test_resuming_from_an_empty_folder_is_refused(tiny_scene, tmp_path, capsys):
     assert "holds no step-*.ckpt" in refusal(capsys, lambda: train(tiny_scene, tmp_path / "out", load_dir=tmp_path))
 
 
-def test_resuming_from_half_a_checkpoint_is_refused(tiny_scene, tmp_path, capsys):
+@pytest.mark.parametrize("named", [False, True])
+def test_resuming_from_half_a_checkpoint_is_refused(tiny_scene, tmp_path, capsys, named):
     config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
     checkpoint = next((path.parent / "nerfstudio_models").glob("*.ckpt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
-    message = refusal(capsys, lambda: train(tiny_scene, tmp_path / "out", 4, load_dir=checkpoint.parent))
-    assert "cannot be read" in message
-    assert "--load-step" in message
+    options = {"load_dir": checkpoint.parent, "load_step": 1 if named else None}
+    message = refusal(capsys, lambda: train(tiny_scene, tmp_path / "out", 4, **options))
+    assert ("--load-step" if named else "holds no checkpoint that can be read") in message
 
 
 def test_resuming_a_learned_overlay_with_a_given_one_is_refused(tiny_scene, tmp_path, capsys):

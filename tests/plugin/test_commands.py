@@ -55,7 +55,6 @@ def config(tiny_scene, tmp_path_factory) -> Path:
         assert process.poll() is None, "the training ended before it wrote a checkpoint"
         assert time.monotonic() < deadline, "no checkpoint was written"
         time.sleep(0.05)
-    time.sleep(0.5)  # so that the checkpoint that was seen is whole
     process.send_signal(signal.SIGKILL)
     process.wait()
     saved = max(int(path.stem.removeprefix("step-")) for path in checkpoints.glob("step-*.ckpt"))
