@@ -5,17 +5,46 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from ssa_nerfstudio.capture.structure import Pass, Report, Settings
+from typing import Literal
 
 MODEL = "model"
 """Folder of the model that was chosen, in COLMAP's binary files; missing where none was found."""
+JOB = "job.json"
+"""What the child is to do."""
+
+Report = Callable[[str, int, int], None]
+"""Called with the stage's name, how much is done and how much there is."""
+
+
+@dataclass(frozen=True)
+class Pass:
+    """Photos of one camera."""
+
+    photos: list[str]
+    """Files in the folder of images, in order."""
+    folder: str
+    """Where features are looked for: copies of the photos, of the same names and size, or the photos themselves."""
+    mask: str | None = None
+    """File of a mask: no feature lies where it is black; None: features lie everywhere."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How structure from motion is done."""
+
+    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
+    """Which pairs are matched; auto: all of them up to 150 photos."""
+    max_image_size: int = 1600
+    """Longest side of the photos that features are looked for in, pixels."""
+    flatten: bool = True
+    """Whether features are looked for in photos without what is the same in all of them."""
+    filter_stationary: bool = True
+    """Whether matches that lie at the same place of both frames (within 4 pixels) are dropped."""
+    threads: int = -1
+    """-1: one a core."""
 
 
 def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Settings, report: Report) -> Path | None:
@@ -35,10 +64,11 @@ def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Se
         OSError: the child ended abnormally, which is how COLMAP tells that it cannot write.
     """
     job = {"images": str(images), "passes": [asdict(each) for each in passes], "settings": asdict(settings)}
+    (folder / JOB).write_text(json.dumps(job), encoding="utf-8")
     log = folder / "log.txt"
     with log.open("w") as errors:
         child = subprocess.Popen(
-            [sys.executable, "-m", "ssa_nerfstudio.capture.structure", json.dumps(job), str(folder)],
+            [sys.executable, "-m", "ssa_nerfstudio.capture.structure", str(folder)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, saving a PNG aborts the process
-import pycolmap
+
+if TYPE_CHECKING:
+    import pycolmap
 
 APPLIED_TRANSFORM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """From COLMAP's world, whose first camera looks along z with y down, to nerfstudio's with z up, [3, 4]."""

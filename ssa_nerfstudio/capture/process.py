@@ -8,21 +8,24 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import PIL.Image  # before pycolmap: loaded the other way round, saving a PNG aborts the process
-import pycolmap
+import PIL.Image
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ssa_nerfstudio.capture.apart import reconstruct
+from ssa_nerfstudio.capture.apart import Pass, Report, Settings, reconstruct
 from ssa_nerfstudio.capture.dataset import POINTS, split, transforms, write_points
+from ssa_nerfstudio.capture.flattening import LEAST_PHOTOS, is_static, static_factor, write_flattened
 from ssa_nerfstudio.capture.ingest import Photo, expected, ingest
 from ssa_nerfstudio.capture.mask import widened
 from ssa_nerfstudio.capture.sources import Source
-from ssa_nerfstudio.capture.structure import Pass, Report, Settings
 from ssa_nerfstudio.capture.work import Work, resumable_work
 from ssa_nerfstudio.errors import refuse
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MASK = "mask_colmap.png"
 """The mask that was used, beside transforms.json: black is ignored, as COLMAP and nerfstudio both have it."""
@@ -97,10 +100,12 @@ def process(
         motion = work.room("motion", [made_from, _digest(mask), asdict(settings) | {"threads": None}])
         if mask is not None:
             PIL.Image.fromarray(mask).save(motion / MASK)
-        masks = [None if mask is None else str(motion / MASK), *[None] * len(sources)]
-        passes = [Pass([photo.name for photo in each], used) for each, used in zip(photos, masks, strict=False)]
+        names = [[photo.name for photo in each] for each in photos]
+        passes = [Pass(each, str(dataset / "images")) for each in names]
+        looked_at = _flatten(names[0], dataset / "images", motion / "flat", settings, report)
+        passes[0] = Pass(names[0], str(looked_at), None if mask is None else str(motion / MASK))
         found = reconstruct(dataset / "images", passes, motion, settings, report)
-        model = found and pycolmap.Reconstruction(found)
+        model = found and _load(found)
         outcome = _judge(work, sources, photos, model, min_registered, mask is not None)
         assert model is not None
         _finish(dataset, sources, photos, model, mask)
@@ -131,6 +136,13 @@ def _progress(console: Console) -> Iterator[Report]:
         yield report
 
 
+def _load(model: Path) -> pycolmap.Reconstruction:
+    # Late, because COLMAP takes over the process's signals; after PIL, because saving a PNG would abort otherwise.
+    import pycolmap
+
+    return pycolmap.Reconstruction(model)
+
+
 def _ingest(sources: Sequence[Source], dataset: Path, frames: int, report: Report) -> list[list[Photo]]:
     total = sum(expected(source, frames) for source in sources)
     done = 0
@@ -144,6 +156,24 @@ def _ingest(sources: Sequence[Source], dataset: Path, frames: int, report: Repor
     photos = [ingest(source, dataset, frames, on_photo) for source in sources]
     report("photos", total, total)
     return photos
+
+
+def _flatten(names: list[str], images: Path, folder: Path, settings: Settings, report: Report) -> Path:
+    """Folder of the photos without what is the same in all of them: their own where nothing is, or it is not asked."""
+    if not settings.flatten or len(names) < LEAST_PHOTOS:
+        return images
+    done = sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
+    if done < len(names):
+        report("artifact", 0, len(names))
+        factor = static_factor([images / name for name in names], settings.max_image_size)
+        if not is_static(factor):
+            report("artifact", len(names), len(names))
+            return images
+        folder.mkdir(exist_ok=True)
+        for number, name in enumerate(names, 1):
+            write_flattened(images / name, folder / name, factor)
+            report("artifact", number, len(names))
+    return folder
 
 
 def _judge(

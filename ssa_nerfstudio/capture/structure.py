@@ -7,16 +7,14 @@ import os
 import shutil
 import sys
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Literal
 
 import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, saving a PNG aborts the process
 import pycolmap
 
-from ssa_nerfstudio.capture.apart import MODEL
+from ssa_nerfstudio.capture.apart import JOB, MODEL, Pass, Report, Settings
 from ssa_nerfstudio.capture.pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
 
 _PAIRS_A_CALL = 64
@@ -24,34 +22,6 @@ _PAIRS_A_CALL = 64
 _PHOTOS_A_THREAD = 2
 
 pycolmap.logging.minloglevel = 3
-
-
-@dataclass(frozen=True)
-class Pass:
-    """Photos of one camera."""
-
-    photos: list[str]
-    """Files in the folder of images, in order."""
-    mask: str | None = None
-    """File of a mask: no feature lies where it is black; None: features lie everywhere."""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """How structure from motion is done."""
-
-    matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which pairs are matched; auto: all of them up to 150 photos."""
-    max_image_size: int = 1600
-    """Longest side of the photos that features are looked for in, pixels."""
-    filter_stationary: bool = True
-    """Whether matches that lie at the same place of both frames (within 4 pixels) are dropped."""
-    threads: int = -1
-    """-1: one a core."""
-
-
-Report = Callable[[str, int, int], None]
-"""Called with the stage's name, how much is done and how much there is."""
 
 
 class Structure:
@@ -93,7 +63,7 @@ class Structure:
                 report("features", len(known), total)
                 pycolmap.extract_features(
                     self._database,
-                    self._images,
+                    each.folder,
                     image_names=names,
                     reader_options=reader,
                     extraction_options=options,
@@ -162,7 +132,7 @@ class Structure:
         return self._settings.threads if self._settings.threads > 0 else os.cpu_count() or 1
 
 
-def _main(job: str, folder: str) -> None:
+def _main(folder: Path) -> None:
     """The child process of `apart.reconstruct`: reports as lines of JSON, and ends when its parent does."""
 
     def end_with_parent() -> None:
@@ -173,13 +143,13 @@ def _main(job: str, folder: str) -> None:
         print(json.dumps(what), flush=True)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
-    told = json.loads(job)
+    told = json.loads((folder / JOB).read_text(encoding="utf-8"))
     passes = [Pass(**each) for each in told["passes"]]
-    structure = Structure(Path(told["images"]), passes, Path(folder), Settings(**told["settings"]))
+    structure = Structure(Path(told["images"]), passes, folder, Settings(**told["settings"]))
     structure.extract(report)
     structure.match(report)
     structure.map(report)
 
 
 if __name__ == "__main__":
-    _main(*sys.argv[1:])
+    _main(Path(sys.argv[1]))

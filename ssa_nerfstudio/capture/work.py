@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -62,6 +63,9 @@ def resumable_work(output: Path) -> Iterator[Work]:
         if not work.kept:
             work.discard()
         raise
+    except KeyboardInterrupt as error:
+        print(f"\nstopped; the same command goes on from the work in {work.folder}", file=sys.stderr)
+        raise SystemExit(130) from error
     except OSError as error:
         work.discard()
         raise refuse(f"{output} cannot be written ({error}); free space there or name another --output") from error

@@ -34,6 +34,9 @@ class Command:
     """Stop when less than this share of a pass's photos could be registered."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """All pairs of photos, or neighbours in time and a net over all; auto: all pairs up to 150 photos."""
+    flatten: bool = True
+    """Look for features in copies of the photos of --train that lack what is the same in all of them, where they share
+    anything; the dataset's photos stay as they are."""
     filter_stationary: bool = True
     """Drop matches that lie at the same place of both frames: what they match is in front of the lens."""
     max_image_size: int = 1600
@@ -49,10 +52,10 @@ class Command:
         """
         from rich.console import Console
 
+        from ssa_nerfstudio.capture.apart import Settings
         from ssa_nerfstudio.capture.mask import read_mask
         from ssa_nerfstudio.capture.process import process
         from ssa_nerfstudio.capture.sources import read_source
-        from ssa_nerfstudio.capture.structure import Settings
 
         for name, lowest in (("frames", 3), ("max_image_size", 64)):
             if (value := getattr(self, name)) < lowest:
@@ -69,7 +72,7 @@ class Command:
             sources.append(read_source(self.clean, "clean", least=1))
         first = sources[0]
         mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
-        settings = Settings(self.matching, self.max_image_size, self.filter_stationary, self.threads)
+        settings = Settings(self.matching, self.max_image_size, self.flatten, self.filter_stationary, self.threads)
         console = Console(highlight=False, soft_wrap=True)
         for source in sources:
             if source.left_out:
