@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
+
+from ssa_nerfstudio.overlay.resampling import straight_color
 
 _SQUARES = (0.5, 0.35)
 
@@ -24,3 +27,9 @@ def over_checkerboard(color: Tensor, alpha: Tensor, side: int = 8) -> Tensor:
     light, dark = _SQUARES
     board = dark + (light - dark) * ((rows + columns) % 2 == 0)[..., None].to(color.dtype)
     return alpha * color + (1.0 - alpha) * board
+
+
+def straight_bytes(transmittance: Tensor, addition: Tensor) -> np.ndarray:
+    """Layers [H, W, 1 or 3] and [H, W, 3] as a straight-alpha picture: RGBA, uint8 [H, W, 4]."""
+    rgba = torch.cat(straight_color(transmittance, addition), dim=-1)
+    return (rgba.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()

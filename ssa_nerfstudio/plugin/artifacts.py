@@ -66,13 +66,28 @@ class Artifacts(nn.Module):
         """Transmittance and added light in front of a training view, at 1 / reduction of its size."""
         return self[self._group_of_view[view]].layers(reduction)
 
-    def layers_of_camera(self, camera: Cameras, width: int, height: int) -> tuple[Tensor, Tensor]:
+    def layers_of_camera(
+        self, camera: Cameras, width: int, height: int, group: int | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Transmittance and added light in front of any camera.
 
-        A camera with the frame of a group shows that group's; a free viewpoint the one of its aspect, or the first.
+        A camera with the frame of a group shows that group's; a free viewpoint the one of its aspect, or the first;
+        unless a group is named.
         """
-        group = match_camera(camera, self._keys)
+        if group is None:
+            group = match_camera(camera, self._keys)
         return fitted(self[nearest_aspect(camera, self._keys) if group is None else group], height, width)
+
+    @torch.no_grad()
+    def covered(self, group: int) -> tuple[Tensor, Tensor]:
+        """Fraction of the frame with a matte above one half, and the mean matte, both on the device."""
+        alpha = 1.0 - self[group].layers()[0].mean(dim=-1)
+        return (alpha > 0.5).float().mean(), alpha.mean()
+
+    def figures(self, group: int) -> str:
+        """`covered` in words."""
+        fraction, mean = (float(value) for value in self.covered(group))
+        return f"{fraction:.1%} of the frame covered, mean matte {mean:.3f}"
 
     def make_room(self, state: dict[str, Any], prefix: str, wanted: bool) -> None:
         """Take the shapes of a checkpoint's overlays, or refuse one that does not fit those that are being trained.

@@ -17,12 +17,14 @@ from ssa_nerfstudio import metrics
 from ssa_nerfstudio.errors import warn
 from ssa_nerfstudio.overlay.layer import composite, composite_over_splats
 from ssa_nerfstudio.overlay.losses import Sparsity, photometric, sparsity
+from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin import guards
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.cameras import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 from ssa_nerfstudio.plugin.upstream import without_lpips
+from ssa_nerfstudio.plugin.viewer import ArtifactControls, in_viewer
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
 
 
@@ -100,6 +102,7 @@ class SSASplatfactoModel(SplatfactoModel):
             dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-6)
             self.gauss_params["features_dc"] = Parameter(dc)
         self.artifacts = Artifacts()
+        self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
         self.metrics_every = 10
         self._make_strategy()
@@ -128,6 +131,11 @@ class SSASplatfactoModel(SplatfactoModel):
             if config.pause_after_reset is not None:
                 self.strategy.pause_refine_after_reset = config.pause_after_reset
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
+
+    @property
+    def overlay(self) -> ArtifactControls | None:
+        """The viewer's elements, under the name of their folder; None where there is no artifact to look at."""
+        return self._controls if len(self.artifacts) else None
 
     def set_scene_extent(self, extent: float) -> None:
         """Tell the radius of the cameras' positions (world units), for `scale_by_extent`."""
@@ -195,6 +203,8 @@ class SSASplatfactoModel(SplatfactoModel):
         drawn = self._render(camera, width // reduction, height // reduction, reduction)
         if not len(self.artifacts):
             return drawn
+        if in_viewer():
+            return self._controls.outputs(drawn, camera, width, height)
         if self.training:
             transmittance, addition = self.artifacts.layers_of_view(metadata(camera)["cam_idx"], reduction)
         else:
@@ -310,6 +320,9 @@ class SSASplatfactoModel(SplatfactoModel):
             values["psnr"] = _psnr(outputs["rgb"], target)
             if shown is not None:
                 values["composite_psnr"] = _psnr(shown, target)
+            for group in range(len(self.artifacts)):
+                suffix = f"_{group}" if len(self.artifacts) > 1 else ""
+                values["overlay_covered" + suffix], values["overlay_matte" + suffix] = self.artifacts.covered(group)
         self.camera_optimizer.get_metrics_dict(values)
         return values
 
@@ -332,8 +345,10 @@ class SSASplatfactoModel(SplatfactoModel):
         pictures = {"img": torch.cat([target, render], dim=1)}
         if "composite" in outputs:
             values["composite_psnr"] = metrics.psnr(outputs["composite"], target)
-            pictures["overlay"] = torch.cat(
-                [outputs["overlay_rgb"] * outputs["overlay_alpha"], outputs["overlay_alpha"].expand_as(target)], dim=1
+            alpha = outputs["overlay_alpha"]
+            pictures["clean_and_composite"] = torch.cat([render, outputs["composite"]], dim=1)
+            pictures["overlay_and_matte"] = torch.cat(
+                [over_checkerboard(outputs["overlay_rgb"], alpha), alpha.expand_as(target)], dim=1
             )
         return values, pictures
 

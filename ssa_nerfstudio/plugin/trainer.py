@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pickle import UnpicklingError
+from typing import Literal
 
 from nerfstudio.configs.base_config import MachineConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
@@ -68,6 +70,20 @@ class SSATrainer(Trainer):
         self.guard = StepGuard(self.config.pipeline.model.max_skipped_steps)
         groups = self.pipeline.get_param_groups()
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self.guard, lambda: self.pipeline.loss)
+
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Set up as upstream does, and say at the end of the training what became of the artifact."""
+        super().setup(test_mode)
+        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._tell_artifact))
+
+    def _tell_artifact(self, step: int) -> None:
+        artifacts = self.pipeline.model.artifacts
+        for group in range(len(artifacts)):
+            name = f"Artifact of camera {group}" if len(artifacts) > 1 else "Artifact"
+            CONSOLE.print(f"[bold]{name}[/bold]: {artifacts.figures(group)}", highlight=False)
+        if len(artifacts):
+            config = self.config.get_base_dir() / "config.yml"
+            CONSOLE.print(f"ssa export-overlay --load-config {config} --output artifact", soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
         """Resume as upstream does; without --load-step from the newest checkpoint that is whole, saying which."""

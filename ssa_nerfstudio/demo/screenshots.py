@@ -1,0 +1,179 @@
+"""The documentation's pictures of the viewer, taken in a real browser: `python -m ssa_nerfstudio.demo.screenshots DIR`.
+
+Chromium is the system's own (Debian: apt install chromium) and draws WebGL in software; nothing is downloaded.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssa_nerfstudio.demo.scene import DemoScene
+from ssa_nerfstudio.effects.dashboard import Dashboard
+from ssa_nerfstudio.errors import refuse
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+_FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
+_PATIENCE = 200
+"""Seconds until a server has to answer: on a loaded machine most of them go into importing."""
+_STEPS = 600
+
+
+def find_chromium() -> str | None:
+    """The system's Chromium or Chrome, or None."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+@contextmanager
+def browser() -> Iterator[Browser]:
+    """A running browser without a window.
+
+    Raises:
+        BadInput: the system has no Chromium.
+    """
+    from playwright.sync_api import sync_playwright
+
+    program = find_chromium()
+    if program is None:
+        raise refuse("there is no Chromium on this machine; Debian: apt install chromium")
+    with sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=program, args=_FLAGS)
+        yield running
+        running.close()
+
+
+@contextmanager
+def viewer_page(browser: Browser, *command: str | Path, width: int = 1100, height: int = 640) -> Iterator[Page]:
+    """The page that a nerfstudio command's viewer serves; the command ends with the block.
+
+    Args:
+        browser: from `browser()`.
+        command: `ns-viewer` or `ns-train` and its options, without the port.
+        width, height: of the page, pixels.
+
+    Raises:
+        RuntimeError: the command ends, or its page does not come up.
+    """
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    program = Path(sys.executable).with_name(str(command[0]))
+    with tempfile.TemporaryFile("w+") as log:
+        process = subprocess.Popen(
+            [program, *command[1:], "--viewer.websocket-port", str(port)],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            env={**os.environ, "CUDA_VISIBLE_DEVICES": "", "PYTHONWARNINGS": "ignore"},
+        )
+        try:
+            _wait_for(f"http://127.0.0.1:{port}", process)
+            page = browser.new_page(viewport={"width": width, "height": height})
+            page.goto(f"http://127.0.0.1:{port}", timeout=1000 * _PATIENCE)
+            _wait_for_elements(page)
+            page.get_by_role("button", name="Hide Train Cams").click()
+            yield page
+            page.close()
+        except RuntimeError as error:
+            log.seek(0)
+            raise RuntimeError(f"{error}\n{log.read()[-3000:]}") from error
+        finally:
+            process.kill()
+            process.wait()
+
+
+def _wait_for(address: str, process: subprocess.Popen) -> None:
+    deadline = time.monotonic() + _PATIENCE
+    while True:
+        if process.poll() is not None:
+            raise RuntimeError("the viewer ended")
+        if time.monotonic() > deadline:
+            raise RuntimeError("the viewer's page did not come up")
+        try:
+            urllib.request.urlopen(address, timeout=5).close()
+            return
+        except OSError:
+            time.sleep(0.3)
+
+
+def _wait_for_elements(page: Page) -> None:
+    """Wait for the last element; a page that connects while the viewer is being built misses some and is reloaded."""
+    from playwright.sync_api import TimeoutError as TooSlow
+
+    last = page.get_by_role("button", name="Save artifact")
+    for _ in range(_PATIENCE // 10):
+        try:
+            last.wait_for(timeout=10_000)
+        except TooSlow:
+            page.reload()
+        else:
+            page.wait_for_timeout(1000)
+            page.reload()
+            last.wait_for(timeout=1000 * _PATIENCE)
+            return
+    raise RuntimeError("the page never had all elements")
+
+
+def main(arguments: list[str]) -> None:
+    """Train the demo's scene and take viewer-training.png, viewer-clean.png and viewer-overlay.png into one folder.
+
+    Raises:
+        BadInput: not exactly one folder is named, or there is no Chromium.
+    """
+    if len(arguments) != 1 or not Path(arguments[0]).is_dir():
+        raise refuse("name one folder for the pictures: python -m ssa_nerfstudio.demo.screenshots docs/images")
+    output = Path(arguments[0])
+    scene = DemoScene()
+    with tempfile.TemporaryDirectory() as scratch, browser() as running:
+        data = Path(scratch) / "dashboard"
+        scene.write(data, Dashboard().layers(scene.height, scene.width, np.random.default_rng(0)))
+        options = ["--data", data, "--output-dir", scratch, "--timestamp", "run", "--machine.device-type", "cpu"]
+        options += ["--max-num-iterations", str(_STEPS), "--pipeline.model.num-downscales", "0"]
+        options += ["--pipeline.model.densify-grad-thresh", "0.006"]
+        run = Path(scratch) / "dashboard" / "ssa-splatfacto" / "run"
+        with viewer_page(running, "ns-train", "ssa-splatfacto", *options) as page:
+            page.get_by_label("Show overlay").click()
+            _look_through_a_camera(page)
+            page.wait_for_function("/Step: [2-9][0-9][0-9]/.test(document.body.innerText)", timeout=1000 * _PATIENCE)
+            page.wait_for_timeout(4000)
+            page.screenshot(path=output / "viewer-training.png")
+            deadline = time.monotonic() + 3 * _PATIENCE
+            while not (run / "nerfstudio_models").exists() or not list((run / "nerfstudio_models").glob("*599.ckpt")):
+                if time.monotonic() > deadline:
+                    raise RuntimeError("the training did not end")
+                time.sleep(1)
+            time.sleep(1)  # so that the checkpoint is whole
+        with viewer_page(running, "ns-viewer", "--load-config", run / "config.yml") as page:
+            page.get_by_label("Show overlay").scroll_into_view_if_needed()
+            _look_through_a_camera(page)
+            page.wait_for_timeout(6000)
+            page.screenshot(path=output / "viewer-clean.png")
+            page.get_by_label("Show overlay").click()
+            page.wait_for_timeout(6000)
+            page.screenshot(path=output / "viewer-overlay.png")
+
+
+def _look_through_a_camera(page: Page) -> None:
+    """Turn from the viewer's first view towards the middle of the scene."""
+    page.mouse.move(300, 300)
+    page.mouse.down()
+    page.mouse.move(300, 340, steps=5)
+    page.mouse.up()
+    page.mouse.wheel(0, 300)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

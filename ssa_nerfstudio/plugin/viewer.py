@@ -1,0 +1,169 @@
+"""The artifact in nerfstudio's viewer: a checkbox, what it shows, a line of figures and a button that saves.
+
+The viewer finds elements by walking every public attribute of the model and shows them in the order of the attributes'
+names, hence the letters in front of them. Where no viewer runs, elements answer with their default, and nothing shows.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import torch
+import viser
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.viewer.render_state_machine import RenderStateMachine
+from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerDropdown, ViewerElement, ViewerSlider
+from torch import Tensor, nn
+
+from ssa_nerfstudio.overlay.layer import composite
+from ssa_nerfstudio.overlay.pictures import over_checkerboard, straight_bytes
+from ssa_nerfstudio.overlay.resampling import straight_color
+from ssa_nerfstudio.plugin.artifacts import Artifacts
+
+LAYERS = ["composite", "artifact", "matte", "clean"]
+"""What "Show overlay" shows: scene and artifact, the artifact over a checkerboard, its matte, the scene."""
+AUTOMATIC = "of the view"
+"""Choice of camera: the group whose frame the view has, as everywhere else."""
+SECONDS_BETWEEN_FIGURES = 1.0
+"""The line of figures waits for the device, so it is not written anew with every frame."""
+
+
+def in_viewer() -> bool:
+    """Whether a viewer draws this frame, and not an evaluation, a render or a training step."""
+    return isinstance(threading.current_thread(), RenderStateMachine)
+
+
+class OnDemand(dict[str, Any]):
+    """Outputs of a model of which some are functions, called when they are first asked for.
+
+    The viewer lists the outputs by name and reads one of them: what is not read costs nothing.
+    """
+
+    def __getitem__(self, name: str) -> Any:
+        value = super().__getitem__(name)
+        if not isinstance(value, Tensor) and callable(value):
+            value = value()
+            self[name] = value
+        return value
+
+
+class ArtifactControls(nn.Module):
+    """The elements, and the frames they ask for. Holds no parameters."""
+
+    def __init__(self, artifacts: Callable[[], Artifacts]) -> None:
+        """Take where the artifacts are to be found: they are put into the model later, or loaded."""
+        super().__init__()
+        self._artifacts = artifacts
+        self._told = 0.0
+        self.a_show = ViewerCheckbox("Show overlay", False, hint="Off: rgb is the clean scene")
+        self.b_layer = ViewerDropdown("Layer", LAYERS[0], LAYERS, hint="What is shown where rgb was")
+        self.c_strength = ViewerSlider("Strength", 1.0, 0.0, 1.0, 0.05, hint="Factor of the matte")
+        self.d_camera = _CameraChoice(lambda: len(artifacts()))
+        self.e_figures = _Line()
+        self.f_save = _SaveButton(self._picture)
+
+    def outputs(self, drawn: dict[str, Any], camera: Cameras, width: int, height: int) -> dict[str, Any]:
+        """A frame of the viewer.
+
+        Args:
+            drawn: the clean scene's outputs.
+            camera, width, height: the viewport: the artifact is fitted into it, letterboxed, never stretched.
+
+        Returns:
+            The outputs with `rgb` as the elements ask for, and composite, overlay_rgb and overlay_alpha on demand.
+        """
+        show, layer, strength, group = self.a_show.value, self.b_layer.value, self.c_strength.value, self._group()
+        clean = drawn["rgb"]
+
+        @cache
+        @torch.no_grad()
+        def layers() -> tuple[Tensor, Tensor]:
+            transmittance, addition = self._artifacts().layers_of_camera(camera, width, height, group)
+            return 1.0 - strength * (1.0 - transmittance), strength * addition
+
+        pictures: dict[str, Callable[[], Tensor]] = {
+            "composite": lambda: composite(clean, *layers()).clamp(0.0, 1.0),
+            "overlay_rgb": lambda: straight_color(*layers())[0],
+            "overlay_alpha": lambda: straight_color(*layers())[1],
+        }
+        if show and layer == "composite":
+            drawn["rgb"] = pictures["composite"]()
+        elif show and layer == "artifact":
+            drawn["rgb"] = over_checkerboard(*straight_color(*layers()))
+        elif show and layer == "matte":
+            drawn["rgb"] = straight_color(*layers())[1].expand_as(clean)
+        if time.monotonic() - self._told > SECONDS_BETWEEN_FIGURES:
+            self._told = time.monotonic()
+            self.e_figures.write(self._artifacts().figures(group or 0))
+        return OnDemand({**drawn, **pictures})
+
+    def _group(self) -> int | None:
+        chosen = self.d_camera.value
+        return None if chosen == AUTOMATIC else int(chosen.rpartition(" ")[2])
+
+    def _picture(self) -> tuple[str, bytes]:
+        """Name and contents of the file that the button saves."""
+        import cv2  # here, so that the commands that never save do not wait for it
+
+        group = self._group() or 0
+        with torch.no_grad():
+            transmittance, addition = self._artifacts()[group].layers()
+        rgba = straight_bytes(transmittance, addition)
+        encoded, png = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
+        assert encoded
+        return f"artifact-camera-{group}.png", png.tobytes()
+
+
+class _CameraChoice(ViewerDropdown[str]):
+    """Which camera group's artifact to look at; hidden where there is one."""
+
+    def __init__(self, count: Callable[[], int]) -> None:
+        super().__init__("Camera", AUTOMATIC, [AUTOMATIC], hint="Whose artifact of a rig's cameras")
+        self._count = count
+
+    def _create_gui_handle(self, viser_server: viser.ViserServer) -> None:
+        count = self._count()
+        self.options, self.visible = [AUTOMATIC, *(f"camera {group}" for group in range(count))], count > 1
+        super()._create_gui_handle(viser_server)
+
+
+class _Line(ViewerElement[str]):
+    """A line of text. No input, whose update would wait for the lock that the drawing thread holds."""
+
+    def __init__(self) -> None:
+        super().__init__("Figures")
+        self._handle: viser.GuiMarkdownHandle | None = None
+
+    def _create_gui_handle(self, viser_server: viser.ViserServer) -> None:
+        self._handle = viser_server.gui.add_markdown("")
+
+    def install(self, viser_server: viser.ViserServer) -> None:
+        self._create_gui_handle(viser_server)
+
+    def write(self, text: str) -> None:
+        if self._handle is not None and self._handle.content != text:
+            self._handle.content = text
+
+
+class _SaveButton(ViewerElement[bool]):
+    """Sends a file to the browser in which it was pressed."""
+
+    def __init__(self, content: Callable[[], tuple[str, bytes]]) -> None:
+        super().__init__("Save artifact")
+        self._content = content
+
+    def _create_gui_handle(self, viser_server: viser.ViserServer) -> None:
+        self.gui_handle = viser_server.gui.add_button(self.name, icon=viser.Icon.DOWNLOAD)
+
+    def install(self, viser_server: viser.ViserServer) -> None:
+        self._create_gui_handle(viser_server)
+        assert isinstance(self.gui_handle, viser.GuiButtonHandle)
+
+        @self.gui_handle.on_click
+        def _(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                event.client.send_file_download(*self._content())

@@ -1,0 +1,92 @@
+"""The viewer in a real browser: the page of a trained model, toggled as a user would."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
+from ssa_nerfstudio.demo import screenshots
+from ssa_nerfstudio.export.checkpoint import Checkpoint
+from ssa_nerfstudio.overlay.layer import fitted
+from ssa_nerfstudio.overlay.resampling import straight_color
+
+pytestmark = pytest.mark.browser
+
+
+@pytest.fixture(scope="module")
+def config(tiny_scene, tmp_path_factory) -> Path:
+    """A tiny model trained on the CPU rasterizer."""
+    folder = tmp_path_factory.mktemp("run")
+    return train_and_evaluate(configure("ssa-splatfacto", tiny_scene, folder, 80, {"num_downscales": 0}))[2]
+
+
+@pytest.fixture(scope="module")
+def page(config) -> Iterator:
+    if screenshots.find_chromium() is None:
+        pytest.skip("no Chromium on this machine; Debian: apt install chromium")
+    pytest.importorskip("playwright.sync_api", reason="no playwright; pip install playwright")
+    command = "ns-viewer", "--load-config", config
+    with (
+        screenshots.browser() as browser,
+        screenshots.viewer_page(browser, *command, width=900, height=500) as page,
+    ):
+        yield page
+
+
+def scene(page) -> np.ndarray:
+    """What the canvas shows, [H, W, 3] in [0, 1]."""
+    box = page.locator("canvas").last.bounding_box()
+    picture = np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    top, left = round(box["y"]), round(box["x"])
+    return picture[top : top + round(box["height"]), left : left + round(box["width"])] / 255.0
+
+
+def eventually(page, holds: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
+    """The first picture of which a condition holds."""
+    for _ in range(120):
+        seen = scene(page)
+        if holds(seen):
+            return seen
+        page.wait_for_timeout(500)
+    raise AssertionError(f"after a minute: {what}")
+
+
+def test_the_artifact_appears_and_disappears(page, config):
+    first = eventually(page, lambda seen: seen.std() > 0.02, "no frame came")
+    height, width = first.shape[:2]
+    color, alpha = straight_color(*fitted(Checkpoint.read(config).artifacts()[0], height, width))
+    color, opaque = color.detach().numpy(), alpha.detach().numpy()[..., 0] > 0.9
+    # The axes that viser draws into the lower left corner.
+    opaque[-80:, :80] = False
+
+    def distance(seen: np.ndarray) -> float:
+        return float(np.abs(seen - color)[opaque].mean())
+
+    assert opaque.mean() > 0.1
+    # The default is off: the clean scene.
+    assert distance(first) > 0.1
+    page.get_by_label("Show overlay").click()
+    shown = eventually(page, lambda seen: distance(seen) < 0.05, "the artifact did not appear")
+    page.get_by_label("Show overlay").click()
+    hidden = eventually(page, lambda seen: distance(seen) > 0.1, "the artifact did not disappear")
+    clear = alpha.detach().numpy()[..., 0] < 0.02
+    assert np.abs(shown - hidden)[clear].mean() < 0.02
+    assert np.abs(first - hidden).mean() < 0.02
+
+
+def test_the_figures_and_the_saved_picture_are_the_artifacts(page, config, tmp_path):
+    overlay = Checkpoint.read(config).artifacts()
+    page.get_by_text(overlay.figures(0)).wait_for(timeout=60_000)
+    with page.expect_download(timeout=60_000) as download:
+        page.get_by_role("button", name="Save artifact").click()
+    assert download.value.suggested_filename == "artifact-camera-0.png"
+    download.value.save_as(tmp_path / "saved.png")
+    saved = np.asarray(Image.open(tmp_path / "saved.png"))
+    transmittance, _ = overlay[0].layers()
+    np.testing.assert_allclose(saved[..., 3] / 255, 1 - transmittance.detach().numpy()[..., 0], atol=0.5 / 255 + 1e-6)
