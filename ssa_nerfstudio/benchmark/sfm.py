@@ -25,21 +25,24 @@ from ssa_nerfstudio.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.simulation.simulate import simulate
 
 WAYS = {
-    "COLMAP": (False, False, False),
-    "mask": (False, False, True),
-    "filter": (False, True, False),
-    "default": (True, True, False),
-    "default and mask": (True, True, True),
+    "COLMAP": (False, False, "none"),
+    "detection": (False, False, "detected"),
+    "mask": (False, False, "true"),
+    "default": (True, True, "none"),
+    "default and detection": (True, True, "detected"),
 }
-"""Flattened photos, dropped stationary matches, true mask (transmittance at most 0.9)."""
+"""Flattened photos, dropped stationary matches, which mask (the true one: where the transmittance is at most 0.9)."""
 
 
-def measure(photos: Path, mask: np.ndarray | None, settings: Settings, true: dict[str, np.ndarray]) -> dict[str, float]:
+def measure(
+    photos: Path, mask: np.ndarray | None, detect: bool, settings: Settings, true: dict[str, np.ndarray]
+) -> dict[str, float]:
     """Runs structure from motion and compares what it found.
 
     Args:
         photos: folder of them.
         mask: bool [height, width], True where features may lie, or None.
+        detect: whether the command finds a mask by itself.
         settings: of structure from motion.
         true: camera centre [3] by the stem of the photo's file.
 
@@ -52,7 +55,7 @@ def measure(photos: Path, mask: np.ndarray | None, settings: Settings, true: dic
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / "dataset"
         try:
-            outcome = process([source], output, mask, min_registered=0, settings=settings)
+            outcome = process([source], output, mask, detect, min_registered=0, settings=settings)
         except BadInput:
             return found
         frames = json.loads((output / "transforms.json").read_text())["frames"]
@@ -77,7 +80,7 @@ class Command:
     effects: tuple[str, ...] = ("none", "dashboard", "ui", "mud")
     """Artifacts; none: clean photos."""
     ways: tuple[str, ...] = tuple(WAYS)
-    """What to do against them: COLMAP (nothing), mask, filter, default, default and mask."""
+    """What to do against them: COLMAP (nothing), detection, mask, default, default and detection."""
     photos: int = 40
     """At most so many training photos, the first in order."""
     max_image_size: int = 1600
@@ -90,7 +93,7 @@ class Command:
         done = [json.loads(line) for line in self.output.read_text().splitlines()] if self.output.exists() else []
         for data in self.data:
             for effect in self.effects:
-                ways = [way for way in self.ways if effect != "none" or "mask" not in way]
+                ways = [way for way in self.ways if effect != "none" or way in ("COLMAP", "default")]
                 asked = [{"data": data.name, "artifact": effect, "way": way} for way in ways]
                 if left := [row for row in asked if not any(row.items() <= other.items() for other in done)]:
                     self._measure(data, effect, left)
@@ -106,10 +109,10 @@ class Command:
             for path in sorted(Dataset.read(capture, eval_interval=8).split[0])[: self.photos]:
                 os.link(capture / path, photos / Path(path).name)
             for row in asked:
-                flatten, filter_stationary, masked = WAYS[row["way"]]
+                flatten, filter_stationary, mask = WAYS[row["way"]]
                 settings = Settings("exhaustive", self.max_image_size, flatten, filter_stationary, self.threads)
-                used = _open_part(capture / "layers/raw.npz") if masked else None
-                result = json.dumps(row | measure(photos, used, settings, true))
+                used = _open_part(capture / "layers/raw.npz") if mask == "true" else None
+                result = json.dumps(row | measure(photos, used, mask == "detected", settings, true))
                 print(result, flush=True)
                 with self.output.open("a") as file:
                     file.write(result + "\n")

@@ -21,19 +21,21 @@ LEAST_PHOTOS = 8
 _MOST_PHOTOS = 64
 _DARK = 8.0
 """Added to 8-bit values before the logarithm: darker differences are noise."""
-_SIGNIFICANT = 2.0
-"""Standard errors below which a median gradient is taken for chance."""
+_CHANCE = 1.0
+"""Standard errors below which a median gradient counts as 0."""
+_CERTAIN = 5.0
+"""Standard errors from which on it is no chance, even among millions and with errors estimated from eight photos."""
+_LEAST_SHARE = 0.005
+"""Share of such gradients from which on photos are worth flattening."""
 _LARGEST_GAIN = 1.4
 """Natural logarithm; beyond a factor of 4 nothing but noise would come back."""
 _COARSEST = 12
 """What varies more slowly than over a 12th of the shorter side is left in: no feature depends on it."""
-_NOTICEABLE = 0.02
-_LEAST_SHARE = 0.005
 _ROWS = 32
 
 
-def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray:
-    """The static factor of photos of one size, up to a constant and slow variations.
+def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray | None:
+    """The static factor of photos of one size, up to a constant and slow variations; None where nothing is static.
 
     Reads at most 64 of them, evenly spaced, in grey; memory is proportional to their number and size.
 
@@ -42,22 +44,25 @@ def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray:
         max_size: longest side to work at, pixels.
 
     Returns:
-        Its natural logarithm, float32 [H, W], smaller than the photos where they exceed `max_size`; 0 where nothing is
-        static.
+        Its natural logarithm, float32 [H, W], smaller than the photos where they exceed `max_size`.
     """
     step = max(1, -(-len(photos) // _MOST_PHOTOS))
     stack = np.stack([_grey(path, max_size) for path in photos[::step]])
     _, height, width = stack.shape
     divergence = np.zeros((height, width), dtype=np.float32)
+    certain = 0
     for top in range(0, height, _ROWS):
         rows = np.log(stack[:, top : top + _ROWS + 1] + np.float32(_DARK))
         kept = min(_ROWS, height - top)
-        across = _typical(np.diff(rows[:, :kept], axis=2))
-        down = _typical(np.diff(rows, axis=1))
+        across, certain_across = _typical(np.diff(rows[:, :kept], axis=2))
+        down, certain_down = _typical(np.diff(rows, axis=1))
+        certain += certain_across + certain_down
         divergence[top : top + kept, :-1] += across
         divergence[top : top + kept, 1:] -= across
         divergence[top : top + len(down)] += down
         divergence[top + 1 : top + 1 + len(down)] -= down
+    if certain < _LEAST_SHARE * 2 * height * width:
+        return None
     factor = _integrate(divergence)
     return factor - cv2.GaussianBlur(factor, (0, 0), min(height, width) / _COARSEST)
 
@@ -76,11 +81,6 @@ def flattened(photo: np.ndarray, factor: np.ndarray) -> np.ndarray:
         factor = cv2.resize(factor, (photo.shape[1], photo.shape[0]), interpolation=cv2.INTER_LINEAR)
     gain = np.exp(np.clip(-factor, -_LARGEST_GAIN, _LARGEST_GAIN))[..., None]
     return np.rint(((photo + np.float32(_DARK)) * gain - _DARK).clip(0, 255)).astype(np.uint8)
-
-
-def is_static(factor: np.ndarray) -> bool:
-    """Whether more than half a percent of the frame is 2 % off what it would be without a static factor [h, w]."""
-    return bool((np.abs(factor) > _NOTICEABLE).mean() > _LEAST_SHARE)
 
 
 def write_flattened(source: Path, target: Path, factor: np.ndarray) -> None:
@@ -103,8 +103,8 @@ def _grey(path: Path, max_size: int) -> np.ndarray:
     return grey
 
 
-def _typical(gradients: np.ndarray) -> np.ndarray:
-    """Median over the photos [N, ...], shrunk to 0 where it is within its standard error."""
+def _typical(gradients: np.ndarray) -> tuple[np.ndarray, int]:
+    """Median over the photos [N, ...], shrunk to 0 where it is within its standard error; how many are no chance."""
     count = len(gradients)
     low, middle, high = count // 4, count // 2, (3 * count) // 4
     ordered = np.partition(gradients, (low, middle, high), axis=0)
@@ -112,8 +112,9 @@ def _typical(gradients: np.ndarray) -> np.ndarray:
     # Normal distribution: deviation = quartile range / 1.349, standard error of the median = 1.253 deviation / sqrt(N).
     error = (ordered[high] - ordered[low]) * (1.253 / 1.349 / np.sqrt(count))
     with np.errstate(divide="ignore", invalid="ignore"):
-        weight = 1 - np.square(_SIGNIFICANT * error / median)
-    return np.where(median == 0, 0, median * weight.clip(0, None))
+        weight = 1 - np.square(_CHANCE * error / median)
+    certain = int((np.abs(median) > _CERTAIN * error).sum())
+    return np.where(median == 0, 0, median * weight.clip(0, None)), certain
 
 
 def _integrate(divergence: np.ndarray) -> np.ndarray:

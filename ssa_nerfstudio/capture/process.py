@@ -17,7 +17,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from ssa_nerfstudio.capture.apart import Pass, Report, Settings, reconstruct
 from ssa_nerfstudio.capture.dataset import POINTS, split, transforms, write_points
-from ssa_nerfstudio.capture.flattening import LEAST_PHOTOS, is_static, static_factor, write_flattened
+from ssa_nerfstudio.capture.detected import detected_mask
+from ssa_nerfstudio.capture.flattening import LEAST_PHOTOS, static_factor, write_flattened
 from ssa_nerfstudio.capture.ingest import Photo, expected, ingest
 from ssa_nerfstudio.capture.mask import widened
 from ssa_nerfstudio.capture.sources import Source
@@ -61,12 +62,15 @@ class Outcome:
     points: int
     reprojection_error: float
     """Mean over the points' observations, pixels of the photos."""
+    masked: float
+    """Share of the first pass's frame in which no features were looked for, in [0, 1]."""
 
 
 def process(
     sources: Sequence[Source],
     output: Path,
     mask: np.ndarray | None = None,
+    detect: bool = False,
     frames: int = 200,
     min_registered: float = 0.5,
     settings: Settings | None = None,
@@ -82,6 +86,7 @@ def process(
         sources: the passes, one or two, the one to train on first.
         output: folder to make.
         mask: bool [height, width] for the first pass, True where features may lie.
+        detect: whether to look for an opaque artifact in the first pass, and to mask it, where no mask is given.
         frames: to take from a pass of videos, at least 1.
         min_registered: the least share of each pass's photos, in [0, 1].
         settings: of structure from motion.
@@ -97,6 +102,10 @@ def process(
         made_from = [(source.name, source.fingerprint(), frames) for source in sources]
         dataset = work.room("dataset", made_from)
         photos = _ingest(sources, dataset, frames, report)
+        if detect and mask is None:
+            files = [dataset / "images" / photo.name for photo in photos[0]]
+            mask = detected_mask(files, lambda done: report("detection", done, len(files)))
+            mask = None if mask is None else widened(mask)
         motion = work.room("motion", [made_from, _digest(mask), asdict(settings) | {"threads": None}])
         if mask is not None:
             PIL.Image.fromarray(mask).save(motion / MASK)
@@ -106,7 +115,7 @@ def process(
         passes[0] = Pass(names[0], str(looked_at), None if mask is None else str(motion / MASK))
         found = reconstruct(dataset / "images", passes, motion, settings, report)
         model = found and _load(found)
-        outcome = _judge(work, sources, photos, model, min_registered, mask is not None)
+        outcome = _judge(work, sources, photos, model, min_registered, mask)
         assert model is not None
         _finish(dataset, sources, photos, model, mask)
         dataset.rename(output)
@@ -166,7 +175,7 @@ def _flatten(names: list[str], images: Path, folder: Path, settings: Settings, r
     if done < len(names):
         report("artifact", 0, len(names))
         factor = static_factor([images / name for name in names], settings.max_image_size)
-        if not is_static(factor):
+        if factor is None:
             report("artifact", len(names), len(names))
             return images
         folder.mkdir(exist_ok=True)
@@ -182,7 +191,7 @@ def _judge(
     photos: Sequence[Sequence[Photo]],
     model: pycolmap.Reconstruction | None,
     min_registered: float,
-    masked: bool,
+    mask: np.ndarray | None,
 ) -> Outcome:
     images = [] if model is None else [image for image in model.images.values() if image.has_pose]
     registered = {image.name for image in images}
@@ -195,7 +204,7 @@ def _judge(
             work.kept = True
             remedy = (
                 "take photos that overlap more"
-                if masked
+                if mask is not None
                 else "give --mask if something covers part of every frame, or photos that overlap more"
             )
             raise refuse(
@@ -203,7 +212,8 @@ def _judge(
                 f"asked for: {remedy}; --min-registered takes less, and goes on from the work in {work.folder}"
             )
     assert model is not None
-    return Outcome(passes, model.num_points3D(), model.compute_mean_reprojection_error())
+    masked = 0.0 if mask is None else float(1 - mask.mean())
+    return Outcome(passes, model.num_points3D(), model.compute_mean_reprojection_error(), masked)
 
 
 def _finish(

@@ -28,6 +28,9 @@ class Command:
     which is COLMAP's and nerfstudio's polarity. Used for poses alone: training sees the whole photos."""
     invert_mask: bool = False
     """White marks the artifact in --mask instead."""
+    detect: bool = False
+    """Detect where an opaque artifact is (see ssa detect) and mask it, where --mask is not given. What light shines
+    through is never masked: the scene behind it would be lost, too."""
     frames: int = 200
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighbourhood."""
     min_registered: float = 0.5
@@ -78,11 +81,15 @@ class Command:
             if source.left_out:
                 console.print(f"{source.path}: {len(source.left_out)} videos beside the photos are left out")
 
-        outcome = process(sources, self.output, mask, self.frames, self.min_registered, settings, console)
+        outcome = process(sources, self.output, mask, self.detect, self.frames, self.min_registered, settings, console)
 
         for each in outcome.passes:
             missing = ", ".join([*each.missing[:5], *["..."][: len(each.missing) > 5]])
             left_out = f"; not: {missing}" if missing else ""
             console.print(f"{each.count} of {each.photos} {each.name} photos registered{left_out}")
+        if self.detect and not outcome.masked:
+            console.print("no opaque artifact was detected: nothing was masked")
+        if outcome.masked:
+            console.print(f"{outcome.masked:.0%} of the frame was masked")
         console.print(f"{outcome.points} points, mean reprojection error {outcome.reprojection_error:.2f} pixels")
         console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}")

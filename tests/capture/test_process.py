@@ -106,3 +106,15 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert "12 of 12 frame photos registered" in done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "photos"]
+
+
+def test_an_opaque_artifact_is_detected_and_masked(tmp_path, capsys):
+    write(tmp_path / "photos", covered())
+    process("--train", tmp_path / "photos", "--output", tmp_path / "out", "--detect", "--no-flatten")
+    said = capsys.readouterr().out
+    assert f"{VIEWS} of {VIEWS} frame photos registered" in said
+    used = np.asarray(Image.open(tmp_path / "out/mask_colmap.png"))
+    true = Dashboard().layers(HEIGHT, WIDTH, np.random.default_rng(0)).transmittance.min(axis=-1) > 0.9
+    assert used.shape == true.shape
+    both, either = (~used & ~true).sum(), (~used | ~true).sum()
+    assert both / either > 0.8
