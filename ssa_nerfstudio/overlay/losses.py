@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
-from functools import lru_cache
+from functools import lru_cache, reduce
 from typing import Literal
 
 import numpy as np
@@ -13,6 +13,9 @@ import torch.nn.functional as F
 from torch import Tensor
 
 Sparsity = Literal["l1", "log", "off"]
+SSIMBody = Literal["fused", "convolution", "shifted-sums"]
+"""How the SSIM term is computed: in kernels together with its gradient, or in torch, as convolutions or as 11 shifted
+and weighted copies a direction (which torch.compile can fuse). The values are the same within rounding."""
 
 LOG_SOFTNESS = 0.1
 """e of the concave penalty log(1 + A / e): below this opacity it acts like l1, above it spares what is opaque."""
@@ -22,7 +25,7 @@ SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels (sigma 1.5); "valid" padding, as pytorch_msssim."""
 
 
-def photometric(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric(prediction: Tensor, target: Tensor, ssim_weight: float, body: SSIMBody = "fused") -> Tensor:
     """(1 - w) mean |prediction - target| + w (1 - SSIM) (paper, equation of L_rgb; w = 0.2).
 
     Where a kernel exists (numba on the CPU, Triton on CUDA), value and gradient come from the same two passes over the
@@ -32,31 +35,41 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tenso
     Args:
         prediction, target: [H, W, 3] in [0, 1]; only the prediction receives a gradient.
         ssim_weight: w in [0, 1]; at 0 SSIM is not computed.
+        body: other than `fused`, always plain torch and autograd.
     """
     if ssim_weight == 0 or min(prediction.shape[:2]) < SSIM_WINDOW:
         return (prediction - target).abs().mean()
+    if body != "fused":
+        return photometric_reference(prediction, target, ssim_weight, body)
     return _Photometric.apply(prediction, target, ssim_weight)  # pyright: ignore[reportReturnType]
 
 
-def photometric_reference(prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:
+def photometric_reference(
+    prediction: Tensor, target: Tensor, ssim_weight: float, body: SSIMBody = "convolution"
+) -> Tensor:
     """`photometric` in plain torch, differentiable in both images: the oracle of the kernels."""
     l1 = (prediction - target).abs().mean()
-    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(prediction, target))
+    return (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - ssim(prediction, target, body))
 
 
-def ssim(prediction: Tensor, target: Tensor) -> Tensor:
+def ssim(prediction: Tensor, target: Tensor, body: SSIMBody = "convolution") -> Tensor:
     """Mean structural similarity over the positions where the whole 11 x 11 window fits ("valid" padding).
 
     K1 = 0.01, K2 = 0.03, data range 1 (Wang et al. 2004), as pytorch_msssim.
 
     Args:
         prediction, target: [H, W, 3] in [0, 1], at least 11 pixels a side.
+        body: convolution or shifted-sums.
     """
     x, y = prediction.permute(2, 0, 1), target.permute(2, 0, 1)
     moments = torch.cat([x, y, x * x + y * y, x * y])[None]
-    window = torch.tensor(gaussian_window(), dtype=x.dtype, device=x.device).expand(moments.shape[1], 1, 1, -1)
-    rows = F.conv2d(moments, window, groups=moments.shape[1])
-    mean_x, mean_y, squares, product = F.conv2d(rows, window.mT, groups=moments.shape[1])[0].chunk(4)
+    if body == "shifted-sums":
+        means = _shifted_sum(_shifted_sum(moments, dim=3), dim=2)
+    else:
+        window = torch.tensor(gaussian_window(), dtype=x.dtype, device=x.device).expand(moments.shape[1], 1, 1, -1)
+        rows = F.conv2d(moments, window, groups=moments.shape[1])
+        means = F.conv2d(rows, window.mT, groups=moments.shape[1])
+    mean_x, mean_y, squares, product = means[0].chunk(4)
     mean_product = mean_x * mean_y
     mean_squares = mean_x * mean_x + mean_y * mean_y
     c1, c2 = 0.01**2, 0.03**2
@@ -91,6 +104,13 @@ def gaussian_window() -> tuple[float, ...]:
     """SSIM's window along one dimension: 11 weights of a Gaussian with sigma 1.5, summing to 1."""
     values = [math.exp(-((i - SSIM_WINDOW // 2) ** 2) / (2 * 1.5**2)) for i in range(SSIM_WINDOW)]
     return tuple(v / sum(values) for v in values)
+
+
+def _shifted_sum(values: Tensor, dim: int) -> Tensor:
+    """The window's weighted mean along one dimension, at the positions where it fits."""
+    length = values.shape[dim] - SSIM_WINDOW + 1
+    shifted = (weight * values.narrow(dim, k, length) for k, weight in enumerate(gaussian_window()))
+    return reduce(torch.add, shifted)
 
 
 class _Photometric(torch.autograd.Function):

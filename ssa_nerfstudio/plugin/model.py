@@ -16,7 +16,7 @@ from torch.nn import Parameter
 from ssa_nerfstudio import metrics
 from ssa_nerfstudio.errors import warn
 from ssa_nerfstudio.overlay.layer import composite, composite_over_splats
-from ssa_nerfstudio.overlay.losses import Sparsity, photometric, sparsity
+from ssa_nerfstudio.overlay.losses import Sparsity, SSIMBody, photometric, sparsity
 from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin import guards
@@ -48,6 +48,9 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """Weight of the sparsity term, the paper's lambda_sparse; not negative."""
     ignore_background: bool = True
     """The overlay gains nothing by hiding background that no splat covers (a sky without points); the paper's does."""
+    ssim: SSIMBody = "fused"
+    """How the SSIM term is computed; the result is the same. fused: kernels, the fastest; convolution, shifted-sums:
+    plain torch, for comparison."""
     strategy: Literal["adc", "mcmc"] = "adc"
     """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
     cap_max: int = 1_000_000
@@ -287,7 +290,7 @@ class SSASplatfactoModel(SplatfactoModel):
         if "mask" in batch:
             mask = self._downscale_if_required(batch["mask"].float()).to(self.device)
             target, shown = target * mask, shown * mask
-        losses = {"main_loss": photometric(shown, target, self.config.ssim_lambda)}
+        losses = {"main_loss": photometric(shown, target, self.config.ssim_lambda, self.config.ssim)}
         if not self.training:
             return losses
         learned = self.artifacts.learned()

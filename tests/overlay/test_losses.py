@@ -14,6 +14,7 @@ from torch import Tensor
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.losses import (
     Sparsity,
+    SSIMBody,
     gaussian_window,
     photometric,
     photometric_reference,
@@ -65,6 +66,18 @@ def test_photometric_value_and_gradient_are_those_of_the_formulas(
         expected, slope = value_and_gradient(oracle, *wide, weight)
         assert value.item() == pytest.approx(expected.item(), abs=TOLERANCE[dtype])
         assert (gradient - slope).norm() < TOLERANCE[dtype] * slope.norm()
+
+
+@pytest.mark.parametrize("body", ["convolution", "shifted-sums"])
+@pytest.mark.parametrize("size", [(11, 11), (12, 30), (37, 20)])
+def test_every_body_of_the_ssim_term_gives_the_same_value_and_gradient(body: SSIMBody, size: tuple[int, int]) -> None:
+    generator = torch.Generator().manual_seed(5)
+    target = torch.rand(*size, 3, generator=generator, dtype=torch.float64)
+    prediction = (target + 0.2 * torch.rand(target.shape, generator=generator, dtype=torch.float64)).requires_grad_()
+    values = [photometric(prediction, target, 0.2, which) for which in ("fused", body)]
+    slopes = [torch.autograd.grad(value, prediction)[0] for value in values]
+    torch.testing.assert_close(values[1], values[0], rtol=1e-12, atol=0)
+    torch.testing.assert_close(slopes[1], slopes[0], rtol=1e-9, atol=1e-15)
 
 
 def test_the_window_is_that_of_pytorch_msssim() -> None:
