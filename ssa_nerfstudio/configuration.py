@@ -116,6 +116,9 @@ def _converted(hint: Any, value: Any, name: str) -> Any:
     if hint is Any:
         return value
     if origin in (Union, types.UnionType):
+        nested = [choice for choice in arguments if dataclasses.is_dataclass(choice)]
+        if len(nested) == 1 and isinstance(value, dict):
+            return _build(nested[0], value)  # so that the message names the key inside
         for choice in arguments:
             try:
                 return _converted(choice, value, name)
