@@ -5,10 +5,10 @@ from __future__ import annotations
 import copy
 import json
 import random
+import resource
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,7 +21,9 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from ssa_nerfstudio.benchmark.machine import versions
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
 
@@ -30,6 +32,12 @@ METHODS: dict[str, SSATrainerConfig] = {
     for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
 }
 """The methods by name."""
+INVISIBLE = 1 / 255
+"""Opacity below which a rasterizer skips a Gaussian."""
+
+
+class Diverged(ArithmeticError):
+    """A training that left nothing to evaluate: values that are not finite, or no Gaussian that can be seen."""
 
 
 @dataclass
@@ -39,13 +47,17 @@ class Outcome:
     metrics: dict[str, float]
     """Means over the test views: psnr (dB), ssim, flip, mean_colour_deviation, composite_psnr, ..."""
     seconds: dict[str, float]
-    """startup (imports apart: photos, statistics, model), training, evaluation."""
+    """startup (photos, model), statistics (of the photos, for the overlay), training, evaluation."""
     gaussians: int
     """Number of Gaussians at the end."""
     peak_memory_mb: float
-    """Largest memory that torch held on the GPU; 0 on a CPU."""
+    """Largest memory that torch held on the GPU while training; on a CPU that of the process."""
     versions: dict[str, str] = field(default_factory=dict)
     """torch, gsplat, nerfstudio, and the device's name."""
+    views: dict[str, dict[str, float]] = field(default_factory=dict)
+    """Metrics of each test view by its file's name."""
+    curve: list[dict[str, float]] = field(default_factory=list)
+    """At the marks: step, seconds (statistics and training so far, evaluations not counted), gaussians, metrics."""
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -53,7 +65,13 @@ class Outcome:
 
 
 def configure(
-    method: str, data: Path, output: Path, steps: int, model: dict[str, Any] | None = None, scale_factor: float = 1.0
+    method: str,
+    data: Path,
+    output: Path,
+    steps: int,
+    model: dict[str, Any] | None = None,
+    scale_factor: float = 1.0,
+    seed: int = 0,
 ) -> SSATrainerConfig:
     """A method's configuration for an unattended run: no viewer, no evaluation in between, one checkpoint at the end.
 
@@ -64,6 +82,7 @@ def configure(
         steps: number of training steps; schedules are scaled to it.
         model: values of the model's configuration by field name.
         scale_factor: photos are resized by this.
+        seed: added to nerfstudio's own, of all random numbers and of the order of the views.
     """
     config = copy.deepcopy(METHODS[method])
     config.vis = "tensorboard"
@@ -71,8 +90,10 @@ def configure(
     config.data, config.output_dir, config.max_num_iterations = data, output, steps
     config.steps_per_save = steps + 1
     config.steps_per_eval_image = 0
+    config.machine.seed += seed
     datamanager = config.pipeline.datamanager
     datamanager.data, datamanager.camera_res_scale_factor = data, scale_factor
+    datamanager.train_cameras_sampling_seed += seed
     datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
     for name, value in (model or {}).items():
         if not hasattr(config.pipeline.model, name):
@@ -82,15 +103,23 @@ def configure(
 
 
 def train_and_evaluate(
-    config: SSATrainerConfig, on_step: Callable[[int], None] = lambda step: None
+    config: SSATrainerConfig,
+    on_step: Callable[[int], None] = lambda step: None,
+    marks: tuple[int, ...] = (),
+    test_scale: float | None = None,
 ) -> tuple[Outcome, SSAPipeline, Path]:
     """Train a configuration to its end and evaluate every test view.
 
     Args:
         on_step: called with the number of finished steps.
+        marks: steps after which the test views are evaluated too, with the clock stopped.
+        test_scale: test photos are resized by this, training photos by the configuration's own.
 
     Returns:
         The outcome, the trained pipeline, and the run's config.yml for `ns-eval`, `ns-export`, `ns-viewer`.
+
+    Raises:
+        Diverged: a Gaussian is not finite, or none can be seen any more.
     """
     start = time.perf_counter()
     seed = config.machine.seed
@@ -98,27 +127,25 @@ def train_and_evaluate(
     np.random.seed(seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
     torch.manual_seed(seed)
     config.set_timestamp()
+    config.pipeline._target = _TimedPipeline
     quiet, CONSOLE.quiet = CONSOLE.quiet, True
     try:
         config.save_config()
         trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
-        trainer.callbacks.append(
-            TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], lambda step: on_step(step + 1))
-        )
-        cuda = trainer.device.startswith("cuda")
-        if cuda:
+        pipeline = cast(_TimedPipeline, trainer.pipeline)
+        pipeline.read_photos(test_scale)
+        clock = _Clock(pipeline, config.max_num_iterations, marks, on_step)
+        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], clock.after_step))
+        if clock.cuda:
             torch.cuda.reset_peak_memory_stats()
-            torch.cuda.synchronize()
-        ready = time.perf_counter()
         trainer.config.viewer.quit_on_train_completion = True
-        trainer.train()
-        if cuda:
-            torch.cuda.synchronize()
-        trained = time.perf_counter()
-        pipeline = trainer.pipeline
-        metrics = pipeline.get_average_eval_image_metrics()
-        evaluated = time.perf_counter()
+        setup = time.perf_counter() - start
+        clock.start()
+        _train(trainer)
+        began = time.perf_counter()
+        views = clock.views if config.max_num_iterations in marks else evaluate(pipeline)
+        evaluated = clock.paused + time.perf_counter() - began
     finally:
         CONSOLE.quiet = quiet
         # nerfstudio keeps its event writers in globals: the next run in this process starts with none.
@@ -126,22 +153,120 @@ def train_and_evaluate(
         writer.EVENT_STORAGE.clear()
         writer.GLOBAL_BUFFER.clear()
     outcome = Outcome(
-        metrics={name: value for name, value in metrics.items() if name not in ("num_rays_per_sec", "fps")},
-        seconds={"startup": ready - start, "training": trained - ready, "evaluation": evaluated - trained},
+        metrics=mean(views),
+        seconds={
+            "startup": setup - pipeline.statistics_seconds,
+            "statistics": pipeline.statistics_seconds,
+            "training": clock.training,
+            "evaluation": evaluated,
+        },
         gaussians=pipeline.model.num_points,
-        peak_memory_mb=torch.cuda.max_memory_allocated() / 2**20 if cuda else 0.0,
+        peak_memory_mb=clock.peak_memory_mb,
         versions=versions(),
+        views=views,
+        curve=clock.curve,
     )
     return outcome, pipeline, config.get_base_dir() / "config.yml"  # pyright: ignore[reportReturnType]
 
 
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on, and the device."""
-    found = {name: version(name) for name in ("torch", "gsplat", "nerfstudio")}
-    found["device"] = (
-        torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
-    )
-    return found
+@torch.no_grad()
+def evaluate(pipeline: SSAPipeline) -> dict[str, dict[str, float]]:
+    """Metrics of each test view by its file's name.
+
+    Raises:
+        Diverged: as `train_and_evaluate`.
+    """
+    _require_alive(pipeline.model)
+    pipeline.eval()
+    names = [path.name for path in pipeline.datamanager.eval_dataset.image_filenames]
+    views = {}
+    for name, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        views[name], _ = pipeline.model.get_image_metrics_and_images(outputs, batch)
+    pipeline.train()
+    return views
+
+
+def mean(views: dict[str, dict[str, float]]) -> dict[str, float]:
+    """Mean over the views of every metric."""
+    names = next(iter(views.values()))
+    return {name: sum(view[name] for view in views.values()) / len(views) for name in names}
+
+
+class _TimedPipeline(SSAPipeline):
+    """A pipeline that tells what the overlay's statistics took, photos decoded beforehand."""
+
+    statistics_seconds = 0.0
+
+    def _set_overlays(self) -> None:
+        _ = self.datamanager.cached_train
+        start = time.perf_counter()
+        super()._set_overlays()
+        self.statistics_seconds = time.perf_counter() - start
+
+    def read_photos(self, test_scale: float | None) -> None:
+        """Decode the training photos, which nothing may have asked for yet; choose the test photos' size."""
+        _ = self.datamanager.cached_train
+        if test_scale is not None and test_scale != self.datamanager.config.camera_res_scale_factor:
+            self.datamanager.config.camera_res_scale_factor = test_scale
+            self.datamanager.eval_dataset = self.datamanager.create_eval_dataset()
+
+
+class _Clock:
+    """Seconds of training, stopped while test views are evaluated."""
+
+    def __init__(
+        self, pipeline: _TimedPipeline, steps: int, marks: tuple[int, ...], on_step: Callable[[int], None]
+    ) -> None:
+        self.cuda = pipeline.model.device.type == "cuda"
+        self.training = self.paused = self.peak_memory_mb = 0.0
+        self.curve: list[dict[str, float]] = []
+        self.views: dict[str, dict[str, float]] = {}
+        self._pipeline, self._steps, self._marks, self._on_step = pipeline, steps, set(marks), on_step
+
+    def start(self) -> None:
+        """Start counting."""
+        self._began = self._now()
+
+    def after_step(self, step: int) -> None:
+        """What happens after every training step, given its number from 0."""
+        done = step + 1
+        self._on_step(done)
+        if done != self._steps and done not in self._marks:
+            return
+        stopped = self._now()
+        self.training = stopped - self._began - self.paused
+        if self.cuda:
+            self.peak_memory_mb = torch.cuda.max_memory_allocated() / 2**20
+        else:
+            self.peak_memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+        if done in self._marks:
+            self.views = evaluate(self._pipeline)
+            seconds = self._pipeline.statistics_seconds + self.training
+            gaussians = self._pipeline.model.num_points
+            self.curve.append({"step": done, "seconds": seconds, "gaussians": gaussians, **mean(self.views)})
+            self.paused += self._now() - stopped
+
+    def _now(self) -> float:
+        if self.cuda:
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def _train(trainer: SSATrainer) -> None:
+    try:
+        trainer.train()
+    except (RuntimeError, ValueError, IndexError) as error:
+        _require_alive(trainer.pipeline.model, error)
+        raise
+
+
+def _require_alive(model: SSASplatfactoModel, cause: Exception | None = None) -> None:
+    for name, values in model.gauss_params.items():
+        if not torch.isfinite(values).all():
+            raise Diverged(f"{name} of a Gaussian is not finite") from cause
+    if not (torch.sigmoid(model.opacities) > INVISIBLE).any():
+        raise Diverged("no Gaussian can be seen any more") from cause
 
 
 @dataclass

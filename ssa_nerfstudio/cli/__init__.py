@@ -7,11 +7,14 @@ import sys
 import warnings
 
 COMMANDS = {
+    "bench": "Train and score a matrix of scenes, artifacts, methods and seeds; resumable.",
     "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
     "process": "Make a nerfstudio dataset from photos or videos, with poses that a static artifact does not mislead.",
+    "report": "Tables and pictures from the results of ssa bench.",
     "simulate": "Put an artifact in front of the training photos of a nerfstudio dataset.",
     "export-overlay": "Write the artifact that a run learned as pictures and masks, and take it off photos.",
     "export-splats": "Write a run's clean splats as PLY, as ns-export gaussian-splat does, and compressed.",
+    "tradeoff": "What accuracy costs in time: one knob at a time and a few together, with frontier and knee.",
 }
 """Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""
 

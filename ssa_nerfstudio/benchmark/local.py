@@ -1,0 +1,152 @@
+"""Runs on this machine: a process each, one a device unless asked otherwise, until done or out of time."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ssa_nerfstudio.benchmark.plan import Run
+from ssa_nerfstudio.benchmark.results import NoResult, Result, read
+from ssa_nerfstudio.benchmark.worker import PROGRESS, Request
+from ssa_nerfstudio.benchmark.workplace import Workplace
+
+POLL = 0.2
+"""Seconds between looks at the processes."""
+PATIENCE = 10.0
+"""Seconds that a process asked to end has before it is killed."""
+
+
+@dataclass
+class Process:
+    """A run at work."""
+
+    run: Run
+    device: str | None
+    """CUDA device; None: the CPU."""
+    popen: subprocess.Popen
+    started: float
+    progress: Path
+
+    def state(self) -> tuple[str, int]:
+        """What it does, and how many training steps are done."""
+        with contextlib.suppress(OSError, ValueError):
+            stage, steps = self.progress.read_text().split()
+            return stage, int(steps)
+        return "starting", 0
+
+
+@dataclass
+class Local:
+    """The processes of a benchmark on this machine."""
+
+    place: Workplace
+    devices: list[str]
+    """CUDA devices; empty: the CPU."""
+    runs_per_device: int
+    command: Callable[[Run], str]
+    """What repeats a run."""
+    keep_models: bool = False
+    processes: list[Process] = field(default_factory=list)
+
+    def work(
+        self,
+        runs: list[Run],
+        estimate: Callable[[Run], float | None],
+        deadline: float | None,
+        watch: Callable[[list[Process], list[Run]], None],
+        ended: Callable[[Run, Result | None], None],
+    ) -> list[Run]:
+        """Runs them in their order.
+
+        Args:
+            runs: what to do.
+            estimate: seconds that a run will take; None: unknown.
+            deadline: `time.monotonic()` by which all has to be over; None: never.
+            watch: called several times a second with the processes and with what waits.
+            ended: called for every run that ended, with its result, None where it left none.
+
+        Returns:
+            The runs that were not done for lack of time.
+        """
+        waiting, left = list(runs), []
+        slots: list[str | None] = [*(self.devices or [None])] * self.runs_per_device
+        try:
+            while waiting or self.processes:
+                for process in [p for p in self.processes if p.popen.poll() is not None]:
+                    self.processes.remove(process)
+                    slots.append(process.device)
+                    ended(process.run, self._result(process.run))
+                if deadline is not None and time.monotonic() > deadline:
+                    left += [process.run for process in self.processes] + waiting
+                    waiting = []
+                    self.stop()
+                while slots and waiting:
+                    run = waiting.pop(0)
+                    if deadline is not None and (estimate(run) or 0.0) > deadline - time.monotonic():
+                        left.append(run)
+                        continue
+                    self.processes.append(self._start(run, slots.pop(0)))
+                watch(self.processes, waiting)
+                if self.processes:
+                    time.sleep(POLL)
+        finally:
+            self.stop()
+        return left
+
+    def stop(self) -> None:
+        """End what is running; such runs start anew next time."""
+        for process in self.processes:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.popen.pid, signal.SIGTERM)
+        for process in self.processes:
+            try:
+                process.popen.wait(PATIENCE)
+            except subprocess.TimeoutExpired:
+                os.killpg(process.popen.pid, signal.SIGKILL)
+                process.popen.wait()
+        self.processes.clear()
+
+    def _start(self, run: Run, device: str | None) -> Process:
+        request = Request(run, str(self.place.folder), self.runs_per_device, self.command(run), self.keep_models)
+        popen = start(request, device)
+        return Process(run, device, popen, time.monotonic(), self.place.running(run.id) / PROGRESS)
+
+    def _result(self, run: Run) -> Result | None:
+        return finish(self.place, run)
+
+
+def start(request: Request, device: str | None) -> subprocess.Popen:
+    """Starts the process of one run, in a group of its own, with its log beside the results."""
+    place = Workplace(Path(request.folder))
+    running = place.running(request.run.id)
+    running.mkdir(parents=True, exist_ok=True)
+    place.log(request.run.id).parent.mkdir(parents=True, exist_ok=True)
+    request.store(running / "request.json")
+    environment = os.environ if device is None else {**os.environ, "CUDA_VISIBLE_DEVICES": device}
+    with place.log(request.run.id).open("w") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "ssa_nerfstudio.benchmark.worker", str(running / "request.json")],
+            stdout=log,
+            stderr=subprocess.STDOUT,
+            stdin=subprocess.DEVNULL,
+            env=environment,
+            start_new_session=True,
+        )
+
+
+def finish(place: Workplace, run: Run) -> Result | None:
+    """Clears up behind a process that ended; its result, None where it left none."""
+    import shutil
+
+    shutil.rmtree(place.running(run.id), ignore_errors=True)
+    try:
+        return read(place.result(run.id))
+    except NoResult:
+        return None

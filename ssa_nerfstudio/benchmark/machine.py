@@ -1,0 +1,106 @@
+"""The machine that a result comes from: versions, revision, and whether a run had the device to itself."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import psutil
+
+PACKAGES = ("torch", "gsplat", "nerfstudio", "numpy", "ssa-nerfstudio")
+"""What a result depends on."""
+BUSY = 0.1
+"""Share of a machine's cores that other processes may use before a run on the CPU no longer has it to itself."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a result depends on, and the device."""
+    import platform
+
+    import torch
+
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    found["device"] = (
+        torch.cuda.get_device_name() if torch.cuda.is_available() else f"CPU, {torch.get_num_threads()} threads"
+    )
+    return found
+
+
+def revision() -> str:
+    """The git revision of this code, with `+` where files differ from it; empty outside a checkout."""
+    folder = Path(__file__).parent
+    try:
+        head = _output("git", "-C", str(folder), "rev-parse", "--short=12", "HEAD").strip()
+        changed = _output("git", "-C", str(folder), "status", "--porcelain", "--untracked-files=no").strip()
+    except (OSError, subprocess.SubprocessError):
+        return ""
+    return head + ("+" if changed else "")
+
+
+def devices() -> list[str]:
+    """CUDA devices that this process may use, as CUDA_VISIBLE_DEVICES names them; empty without CUDA."""
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    if visible is not None:
+        return [name for name in visible.split(",") if name.strip()]
+    try:
+        lines = _output("nvidia-smi", "--list-gpus").splitlines()
+    except (OSError, subprocess.SubprocessError):
+        return []
+    return [str(number) for number, line in enumerate(line for line in lines if line.startswith("GPU "))]
+
+
+class Company:
+    """Who else used the device while a run did: on CUDA other processes on it, on a CPU other processes' share."""
+
+    def __init__(self) -> None:
+        """Start watching, before this process has touched CUDA."""
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
+        self._device = visible.split(",")[0] if visible else ("0" if devices() else None)
+        self._others = self._processes() > 0
+        self._start = time.perf_counter(), _busy(), _own()
+
+    def share_of_cores(self) -> float:
+        """Share of the machine's cores that other processes used since the start, in [0, 1]."""
+        start, busy, own = self._start
+        elapsed = max(1e-3, time.perf_counter() - start)
+        others = (_busy() - busy) - (_own() - own)
+        return min(1.0, max(0.0, others / elapsed / (psutil.cpu_count() or 1)))
+
+    def alone(self) -> bool:
+        """Whether, as far as can be seen from here, the device was this run's alone."""
+        if self._device is not None:
+            return not self._others and self._processes() <= 1
+        return self.share_of_cores() <= BUSY
+
+    def _processes(self) -> int:
+        """Processes on the CUDA device; 0 where it cannot be asked."""
+        if self._device is None:
+            return 0
+        try:
+            found = _output("nvidia-smi", "-i", self._device, "--query-compute-apps=pid", "--format=csv,noheader")
+        except (OSError, subprocess.SubprocessError):
+            return 0
+        return len(found.split())
+
+
+def _busy() -> float:
+    """Seconds that all cores have worked, whoever for."""
+    times = psutil.cpu_times()
+    return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
+
+
+def _own() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _output(*command: str) -> str:
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout

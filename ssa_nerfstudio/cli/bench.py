@@ -1,0 +1,105 @@
+"""`ssa bench`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from ssa_nerfstudio.errors import refuse
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.benchmark.plan import Run
+    from ssa_nerfstudio.benchmark.specification import Benchmark
+
+
+@dataclass
+class Command:
+    """Train and score scenes x effects x methods x seeds; go on where an earlier call stopped."""
+
+    benchmark: Annotated[str, tyro.conf.Positional]
+    """smoke, captures, mipnerf360, two-pass, or a .yaml file."""
+    output: Path
+    """Folder of the results; an earlier one is brought up to date, a finished run is never repeated."""
+    scenes: tuple[str, ...] = ()
+    """Only these scenes."""
+    only: tuple[str, ...] = ()
+    """Only runs whose ids match one of these shell patterns, for example '*-rain-*' (--list shows the ids)."""
+    time_limit: float | None = None
+    """Minutes: no run is started that would not end in time, what still runs then is stopped, and what is left is
+    said. Call again to go on."""
+    runs_per_device: int = 1
+    """Runs that share a GPU (or the CPU) at a time; above 1 their seconds count for no frontier."""
+    scheduler: str | None = None
+    """Address of a dask.distributed scheduler; its workers must see --output under the same path."""
+    prepare_only: bool = False
+    """Make the datasets and drawn effects, and stop: for machines that cannot draw them."""
+    merge: tuple[Path, ...] = ()
+    """Take over the results of these folders first."""
+    keep_models: bool = False
+    """Keep config.yml and checkpoint of every run in models/, for ns-viewer and ns-export."""
+    list: bool = False
+    """Print the ids of the runs, and which are done, and stop."""
+    threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Photos worked on at once while datasets are made."""
+
+    def run(self) -> None:
+        """Bring the folder up to date.
+
+        Raises:
+            BadInput: the arguments, the benchmark or a capture cannot be worked with.
+        """
+        from ssa_nerfstudio.benchmark.plan import plan
+        from ssa_nerfstudio.benchmark.specification import read_benchmark
+
+        benchmark = read_benchmark(self.benchmark)
+        runs = plan(benchmark)
+        if not runs:
+            raise refuse(f"{self.benchmark} states no parts; `ssa tradeoff {self.benchmark}` may be what you want")
+        left = update(self, "bench", benchmark, runs)
+        if left == 0 and not (self.prepare_only or self.list):
+            print(f"All {self.benchmark} runs that were asked for are done: ssa report {self.output}")
+
+
+def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]) -> int:
+    """What bench and tradeoff share: brings the folder up to date with the runs; how many are left."""
+    from rich.console import Console
+
+    from ssa_nerfstudio.benchmark import bench
+    from ssa_nerfstudio.benchmark.report import store_plan
+    from ssa_nerfstudio.benchmark.results import merge, read_all
+    from ssa_nerfstudio.benchmark.scenes import prepare
+
+    for option in ("runs_per_device", "threads"):
+        if getattr(command, option) < 1:
+            raise refuse(f"--{option.replace('_', '-')} must be at least 1, got {getattr(command, option)}")
+    if command.time_limit is not None and command.time_limit <= 0:
+        raise refuse(f"--time-limit must be a positive number of minutes, got {command.time_limit:g}")
+    runs = bench.select(planned, command.scenes, command.only)
+    place = bench.reach(command.output)
+    console = Console(highlight=False, soft_wrap=True)
+    if command.list:
+        done = {result.run.id: result.status for result in read_all([command.output])[0]}
+        for run in runs:
+            print(f"{done.get(run.id, 'to do'):<9} {run.id}")
+        return 0
+    with place.held():
+        for folder in command.merge:
+            if not (folder / "results").is_dir():
+                raise refuse(f"--merge {folder} holds no results; name the --output folder of another ssa bench")
+            console.print(f"{merge(folder, command.output)} results taken over from {folder}")
+        store_plan(command.output, name, benchmark, planned)
+        if command.prepare_only:
+            prepare(runs, place.scenes, place.artifacts, command.threads)
+            console.print(f"{len({run.dataset for run in runs})} datasets are ready in {place.scenes}")
+            return 0
+        options = bench.Options(
+            command.threads, command.runs_per_device, command.time_limit, command.scheduler, command.keep_models
+        )
+        left = bench.bench(runs, place, f"ssa {name} {command.benchmark}", options, console)
+    if left:
+        console.print(f"{len(left)} of {len(runs)} runs are left; call the same again to go on. First: {left[0].id}")
+    return len(left)

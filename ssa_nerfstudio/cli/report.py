@@ -1,0 +1,39 @@
+"""`ssa report`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+
+@dataclass
+class Command:
+    """Tables, paired differences and pictures from the results of `ssa bench`, as HTML and Markdown."""
+
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Output folders of `ssa bench`; several are added up."""
+    output: Path | None = None
+    """Folder of the report; `report` in the first folder where not given."""
+
+    def run(self) -> None:
+        """Write the report and say what was ignored.
+
+        Raises:
+            BadInput: there are no results.
+        """
+        from rich.console import Console
+
+        from ssa_nerfstudio.benchmark.report import report
+        from ssa_nerfstudio.errors import refuse
+
+        if not self.folders:
+            raise refuse("name the --output folder of ssa bench: ssa report DIR")
+        files, problems = report([*self.folders], self.output or self.folders[0] / "report")
+        console = Console(highlight=False, soft_wrap=True)
+        for problem in problems:
+            console.print(f"ignored: {problem}", style="yellow")
+        for file in files:
+            console.print(str(file))
