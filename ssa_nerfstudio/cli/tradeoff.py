@@ -1,0 +1,44 @@
+"""`ssa tradeoff`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ssa_nerfstudio.cli.bench import Command as BenchCommand
+from ssa_nerfstudio.cli.bench import update
+from ssa_nerfstudio.errors import refuse
+
+
+@dataclass
+class Command(BenchCommand):
+    """Vary one knob at a time and a few together, and draw what accuracy costs in time."""
+
+    report_only: bool = False
+    """Start nothing; draw what the folder holds."""
+
+    def run(self) -> None:
+        """Run what is missing, then write frontier figures, CSV and tables into the folder's `tradeoff`.
+
+        Raises:
+            BadInput: the arguments or the benchmark cannot be worked with, or no run had its device to itself.
+        """
+        from rich.console import Console
+
+        from ssa_nerfstudio.benchmark.plan import plan_tradeoff
+        from ssa_nerfstudio.benchmark.specification import read_benchmark
+
+        benchmark = read_benchmark(self.benchmark)
+        if benchmark.tradeoff is None:
+            raise refuse(f"{self.benchmark} states no tradeoff; add the key 'tradeoff' or name another benchmark")
+        if not self.report_only:
+            update(self, "tradeoff", benchmark, plan_tradeoff(benchmark))
+        if self.prepare_only or self.list:
+            return
+        from ssa_nerfstudio.benchmark.tradeoff import analyse
+
+        console = Console(highlight=False, soft_wrap=True)
+        files, problems = analyse([self.output, *self.merge], self.output / "tradeoff")
+        for problem in problems:
+            console.print(f"left out: {problem}", style="yellow")
+        for file in files:
+            console.print(str(file))
