@@ -1,0 +1,161 @@
+"""`ssa bench` around its runs: selection, expectations, time limits, locks, clusters, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from made_results import benchmark, folder_of, result
+
+from ssa_nerfstudio.benchmark.bench import Expectation, select
+from ssa_nerfstudio.benchmark.plan import plan
+from ssa_nerfstudio.benchmark.results import read_all
+from ssa_nerfstudio.benchmark.specification import read_benchmark
+from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.errors import BadInput
+
+SSA = (sys.executable, "-m", "ssa_nerfstudio")
+
+SHORT = """
+scenes:
+  - data: demo
+    model: {num_downscales: 0}
+candidates:
+  misspelt: {sparsness: log}
+parts:
+  - {methods: [3dgs, misspelt], effects: [none], steps: 5}
+"""
+
+
+def ssa(*arguments: str | Path) -> subprocess.CompletedProcess:
+    return subprocess.run([*SSA, *arguments], capture_output=True, text=True, timeout=300)
+
+
+def test_scenes_and_patterns_select_runs():
+    runs = plan(benchmark())
+    chosen = select(runs, ("barn",), ("*-mud-given-*", "*-none-3dgs-adc-*"))
+    assert {(run.scene, run.effect, run.method) for run in chosen} == {
+        ("barn", "mud", "given"),
+        ("barn", "none", "3dgs"),
+    }
+    assert select(runs, (), ()) == runs
+
+
+def test_a_run_takes_as_long_as_those_like_it():
+    runs = plan(benchmark())
+    known = [result(run) for run in runs if run.scene == "attic" and run.densification == "adc"]
+    expected = Expectation(known)
+    assert Expectation([]).seconds(runs[0]) is None
+    assert expected.seconds(runs[0]) == pytest.approx(8 + 700 / 100)
+    longer = dataclasses.replace(runs[0], steps=7000)
+    assert expected.seconds(longer) == pytest.approx(8 + 7000 / 100)
+    elsewhere = next(run for run in runs if run.scene == "barn" and run.densification == "mcmc")
+    assert expected.seconds(elsewhere) == pytest.approx(15)
+    slow = result(elsewhere, seconds={"startup": 5, "statistics": 1, "training": 70, "evaluation": 2})
+    assert Expectation([*known, slow]).seconds(elsewhere) == pytest.approx(78)
+
+
+def test_no_run_is_started_that_would_not_end_in_time(tmp_path):
+    runs = plan(read_benchmark("smoke"))
+    slow = {"startup": 5.0, "statistics": 0.0, "training": 5000.0, "evaluation": 1.0}
+    folder_of(tmp_path, [result(runs[0], seconds=slow)])
+    (tmp_path / "scenes").mkdir()
+    for run in runs:
+        (tmp_path / "scenes" / run.dataset).mkdir(exist_ok=True)
+    done = ssa("bench", "smoke", "--output", tmp_path, "--time-limit", "10")
+    assert done.returncode == 0, done.stderr
+    assert "4 of 5 runs are left; call the same again to go on" in done.stdout
+    assert not (tmp_path / "logs").exists()
+
+
+def test_what_runs_at_the_time_limit_is_stopped_and_leaves_nothing(tmp_path):
+    started = time.monotonic()
+    done = ssa("bench", "smoke", "--output", tmp_path, "--only", "*-none-3dgs-*", "--time-limit", "0.05")
+    assert done.returncode == 0, done.stderr
+    assert "1 of 1 runs are left" in done.stdout
+    assert time.monotonic() - started < 120
+    assert read_all([tmp_path]) == ([], [])
+    workers = [p for p in psutil.process_iter(["cmdline"]) if any(str(tmp_path) in a for a in p.info["cmdline"] or ())]
+    assert workers == []
+    assert ssa("bench", "smoke", "--output", tmp_path, "--list").stdout.count("to do") == 5
+
+
+def test_results_of_other_folders_are_taken_over(tmp_path, capsys):
+    runs = plan(read_benchmark("smoke"))
+    folder_of(tmp_path / "there", [result(run) for run in runs])
+    main(["bench", "smoke", "--output", str(tmp_path / "here"), "--merge", str(tmp_path / "there")])
+    assert "All smoke runs" in capsys.readouterr().out
+    assert len(read_all([tmp_path / "here"])[0]) == 5
+
+
+def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "rain.yaml"
+    path.write_text("scenes: [{data: demo}]\nparts: [{methods: [3dgs], effects: [rain]}]")
+    main(["bench", str(path), "--output", str(tmp_path / "there"), "--prepare-only"])
+    assert "1 datasets are ready" in capsys.readouterr().out
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there" / "artifacts").rename(tmp_path / "here" / "artifacts")
+    monkeypatch.setitem(sys.modules, "albumentations", None)  # as on a machine without it
+    main(["bench", str(path), "--output", str(tmp_path / "here"), "--prepare-only"])
+    for name in ("images/train_0003.png", "layers/undistorted_B.png", "transforms.json"):
+        there, here = (tmp_path / side / "scenes" / "demo-rain" / name for side in ("there", "here"))
+        assert there.read_bytes() == here.read_bytes()
+
+
+def test_a_dask_cluster_runs_what_it_is_given_and_a_failure_is_told_with_its_reason(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    local = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "protocol": "tcp", "dashboard_address": None}
+    with distributed.LocalCluster(**local) as cluster:
+        done = ssa("bench", path, "--output", tmp_path / "out", "--scheduler", cluster.scheduler_address)
+    assert done.returncode == 0, done.stderr
+    found = {r.run.method: r for r in read_all([tmp_path / "out"])[0]}
+    assert found["3dgs"].status == "finished", found["3dgs"].reason
+    assert found["misspelt"].status == "failed"
+    assert "sparsness" in found["misspelt"].reason
+    assert "failed: AttributeError" in done.stdout
+    again = ssa("bench", path, "--output", tmp_path / "out", "--list").stdout
+    assert "finished" in again
+    assert "failed" in again
+
+
+@pytest.mark.parametrize(
+    ("arguments", "culprit"),
+    [
+        (["nothing"], "benchmarks has no 'nothing'"),
+        (["smoke", "--scenes", "garden"], "no scene 'garden'"),
+        (["smoke", "--only", "*-snow-*"], "matches no run"),
+        (["smoke", "--time-limit", "0"], "--time-limit"),
+        (["smoke", "--runs-per-device", "0"], "--runs-per-device"),
+        (["smoke", "--merge", "nowhere"], "holds no results"),
+        (["captures", "--prepare-only"], "set SSA_DATA"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(tmp_path, monkeypatch, capsys, arguments, culprit):
+    monkeypatch.setenv("SSA_DATA", str(tmp_path / "empty"))
+    with pytest.raises(BadInput) as refusal:
+        main(["bench", *arguments, "--output", str(tmp_path / "out")])
+    assert refusal.value.code == 2
+    assert culprit in refusal.value.message
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out" / "scenes").exists()
+
+
+def test_a_second_benchmark_in_one_folder_is_refused(tmp_path):
+    with (tmp_path / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(BadInput, match="another ssa bench"):
+            main(["bench", "smoke", "--output", str(tmp_path)])
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="is a file"):
+        main(["bench", "smoke", "--output", str(tmp_path / "file")])
