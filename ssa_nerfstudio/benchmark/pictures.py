@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from ssa_nerfstudio.demo.run import over_checkerboard
+from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 
 WIDEST = 480
@@ -32,17 +32,16 @@ def take(pipeline: SSAPipeline, folder: Path) -> None:
     camera, batch = pipeline.datamanager.fixed_indices_eval_dataloader[len(pipeline.datamanager.eval_dataset) // 2]
     drawn = pipeline.model.get_outputs_for_camera(camera)
     pictures = {
-        "photo": _array(photos[len(photos) // 2]["image"]),
-        "test": _array(batch["image"]),
-        "render": _array(drawn["rgb"]),
+        "photo": photos[len(photos) // 2]["image"],
+        "test": batch["image"],
+        "render": drawn["rgb"],
     }
     if "overlay_alpha" in drawn:
-        matte = _array(drawn["overlay_alpha"])
-        pictures["artifact"] = over_checkerboard(_array(drawn["overlay_rgb"]), matte)
-        pictures["matte"] = np.repeat(matte, 3, axis=2)
+        pictures["artifact"] = over_checkerboard(drawn["overlay_rgb"], drawn["overlay_alpha"])
+        pictures["matte"] = drawn["overlay_alpha"].expand_as(drawn["rgb"])
     folder.mkdir(parents=True, exist_ok=True)
     for name, values in pictures.items():
-        picture = Image.fromarray(np.rint(values * 255).astype(np.uint8))
+        picture = Image.fromarray(np.rint(_array(values) * 255).astype(np.uint8))
         picture.thumbnail((WIDEST, WIDEST), Image.Resampling.BOX)
         picture.save(folder / f"{name}.jpg", quality=88)
 

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 import torch
@@ -22,6 +22,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.benchmark.machine import versions
+from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
@@ -127,10 +128,11 @@ def train_and_evaluate(
     np.random.seed(seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
     torch.manual_seed(seed)
     config.set_timestamp()
-    config.pipeline._target = _TimedPipeline
     quiet, CONSOLE.quiet = CONSOLE.quiet, True
     try:
         config.save_config()
+        # Not in config.yml, which other commands load.
+        config.pipeline._target, config.pipeline.datamanager._target = _TimedPipeline, _TimedDatamanager
         trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         pipeline = cast(_TimedPipeline, trainer.pipeline)
@@ -193,16 +195,28 @@ def mean(views: dict[str, dict[str, float]]) -> dict[str, float]:
     return {name: sum(view[name] for view in views.values()) / len(views) for name in names}
 
 
+class _TimedDatamanager(SSADatamanager):
+    """A datamanager that tells what decoding and undistorting took."""
+
+    photo_seconds = 0.0
+
+    def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]):
+        start = time.perf_counter()
+        photos = super()._load_images(split, cache_images_device)
+        self.photo_seconds += time.perf_counter() - start
+        return photos
+
+
 class _TimedPipeline(SSAPipeline):
-    """A pipeline that tells what the overlay's statistics took, photos decoded beforehand."""
+    """A pipeline that tells what the overlay's statistics took, without decoding the photos."""
 
     statistics_seconds = 0.0
 
     def _set_overlays(self) -> None:
-        _ = self.datamanager.cached_train
         start = time.perf_counter()
         super()._set_overlays()
-        self.statistics_seconds = time.perf_counter() - start
+        # The photos may have been decoded meanwhile.
+        self.statistics_seconds = time.perf_counter() - start - cast(_TimedDatamanager, self.datamanager).photo_seconds
 
     def read_photos(self, test_scale: float | None) -> None:
         """Decode the training photos, which nothing may have asked for yet; choose the test photos' size."""
