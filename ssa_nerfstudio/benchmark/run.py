@@ -22,6 +22,7 @@ from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.benchmark.machine import versions
+from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
@@ -120,7 +121,7 @@ def train_and_evaluate(
         The outcome, the trained pipeline, and the run's config.yml for `ns-eval`, `ns-export`, `ns-viewer`.
 
     Raises:
-        Diverged: a Gaussian is not finite, or none can be seen any more.
+        Diverged: a Gaussian is not finite, none can be seen any more, or the guards gave the training up.
     """
     start = time.perf_counter()
     seed = config.machine.seed
@@ -270,6 +271,10 @@ class _Clock:
 def _train(trainer: SSATrainer) -> None:
     try:
         trainer.train()
+    except TrainingFailed as error:
+        if error.__cause__ is not None:  # the disk, not the numbers
+            raise
+        raise Diverged(error.message) from error
     except (RuntimeError, ValueError, IndexError) as error:
         _require_alive(trainer.pipeline.model, error)
         raise

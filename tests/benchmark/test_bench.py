@@ -15,8 +15,10 @@ from made_results import benchmark, folder_of, result
 
 from ssa_nerfstudio.benchmark.bench import Expectation, select
 from ssa_nerfstudio.benchmark.plan import plan
-from ssa_nerfstudio.benchmark.results import read_all
-from ssa_nerfstudio.benchmark.specification import read_benchmark
+from ssa_nerfstudio.benchmark.results import read_all, write
+from ssa_nerfstudio.benchmark.specification import Part, SceneEntry, read_benchmark
+from ssa_nerfstudio.benchmark.worker import Request, work
+from ssa_nerfstudio.benchmark.workplace import Workplace
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import BadInput
 
@@ -26,10 +28,8 @@ SHORT = """
 scenes:
   - data: demo
     model: {num_downscales: 0}
-candidates:
-  misspelt: {sparsness: log}
 parts:
-  - {methods: [3dgs, misspelt], effects: [none], steps: 5}
+  - {methods: [3dgs], effects: [none], steps: 5}
 """
 
 
@@ -108,7 +108,7 @@ def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monk
         assert there.read_bytes() == here.read_bytes()
 
 
-def test_a_dask_cluster_runs_what_it_is_given_and_a_failure_is_told_with_its_reason(tmp_path):
+def test_a_dask_cluster_runs_what_it_is_given(tmp_path):
     distributed = pytest.importorskip("distributed")
     path = tmp_path / "short.yaml"
     path.write_text(SHORT)
@@ -116,14 +116,23 @@ def test_a_dask_cluster_runs_what_it_is_given_and_a_failure_is_told_with_its_rea
     with distributed.LocalCluster(**local) as cluster:
         done = ssa("bench", path, "--output", tmp_path / "out", "--scheduler", cluster.scheduler_address)
     assert done.returncode == 0, done.stderr
-    found = {r.run.method: r for r in read_all([tmp_path / "out"])[0]}
-    assert found["3dgs"].status == "finished", found["3dgs"].reason
-    assert found["misspelt"].status == "failed"
-    assert "sparsness" in found["misspelt"].reason
-    assert "failed: AttributeError" in done.stdout
-    again = ssa("bench", path, "--output", tmp_path / "out", "--list").stdout
-    assert "finished" in again
-    assert "failed" in again
+    (found,), problems = read_all([tmp_path / "out"])
+    assert (found.status, problems) == ("finished", []), found.reason
+    assert len(found.views) == 4
+    assert not list((tmp_path / "out" / "running").iterdir())
+
+
+def test_a_run_that_fails_says_why(tmp_path):
+    part = Part(methods=("misspelt",), steps=5)
+    made = benchmark(scenes=(SceneEntry("demo"),), parts=(part,), candidates={"misspelt": {"sparsness": "log"}})
+    (run,) = plan(made)
+    place = Workplace(tmp_path)
+    place.running(run.id).mkdir(parents=True)
+    failed = work(Request(run, str(tmp_path), 1, "the command"))
+    assert (failed.status, failed.command) == ("failed", "the command")
+    assert "the model has no setting 'sparsness'" in failed.reason
+    write(failed, place.result(run.id))
+    assert Expectation(read_all([tmp_path])[0]).seconds(run) is None
 
 
 @pytest.mark.parametrize(
