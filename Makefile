@@ -1,7 +1,8 @@
 # Everything runs in .venv, which is made when it is missing and brought up to date when pyproject.toml has changed.
 #   make demo                  the built-in scene, about three minutes on two cores without a GPU
 #   make demo DATA=folder      the same comparison on your nerfstudio dataset
-#   make test, make lint       what .ci/run runs
+#   make docs                  the documentation as a site, in site/
+#   make test, make lint       what .ci/run runs, with make docs
 
 VENV := .venv
 READY := $(VENV)/.ready
@@ -12,7 +13,7 @@ PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3 python; do \
 DATA ?=
 DEMO_OPTIONS ?=
 
-.PHONY: setup demo test lint format clean
+.PHONY: setup demo docs test lint format clean
 
 setup: $(READY)
 
@@ -27,6 +28,9 @@ $(READY): pyproject.toml Makefile
 demo: $(READY)
 	$(BIN)/ssa demo $(if $(DATA),--data "$(DATA)") $(DEMO_OPTIONS)
 
+docs: $(READY)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -W ignore -m mkdocs build --strict --quiet
+
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
@@ -40,4 +44,4 @@ format: $(READY)
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) outputs build *.egg-info
+	rm -rf $(VENV) outputs build site *.egg-info

@@ -146,7 +146,7 @@ def main(arguments: list[str]) -> None:
         run = Path(scratch) / "dashboard" / "ssa-splatfacto" / "run"
         with viewer_page(running, "ns-train", "ssa-splatfacto", *options) as page:
             page.get_by_label("Show overlay").click()
-            _look_through_a_camera(page)
+            _look_at_the_scene(page)
             page.wait_for_function("/Step: [2-9][0-9][0-9]/.test(document.body.innerText)", timeout=1000 * _PATIENCE)
             page.wait_for_timeout(4000)
             page.screenshot(path=output / "viewer-training.png")
@@ -158,7 +158,7 @@ def main(arguments: list[str]) -> None:
             time.sleep(1)  # so that the checkpoint is whole
         with viewer_page(running, "ns-viewer", "--load-config", run / "config.yml") as page:
             page.get_by_label("Show overlay").scroll_into_view_if_needed()
-            _look_through_a_camera(page)
+            _look_at_the_scene(page)
             page.wait_for_timeout(6000)
             page.screenshot(path=output / "viewer-clean.png")
             page.get_by_label("Show overlay").click()
@@ -166,13 +166,13 @@ def main(arguments: list[str]) -> None:
             page.screenshot(path=output / "viewer-overlay.png")
 
 
-def _look_through_a_camera(page: Page) -> None:
-    """Turn from the viewer's first view towards the middle of the scene."""
-    page.mouse.move(300, 300)
-    page.mouse.down()
-    page.mouse.move(300, 340, steps=5)
-    page.mouse.up()
-    page.mouse.wheel(0, 300)
+def _look_at_the_scene(page: Page) -> None:
+    """Move from the viewer's first view towards the boxes, and leave out the logo, which is on the internet."""
+    page.add_style_tag(content="img[alt='NerfStudio Logo'] { visibility: hidden }")
+    page.mouse.move(600, 500)
+    page.mouse.down(button="right")
+    page.mouse.move(330, 330, steps=8)
+    page.mouse.up(button="right")
 
 
 if __name__ == "__main__":

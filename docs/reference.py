@@ -1,0 +1,79 @@
+"""A hook of mkdocs: writes the reference of commands and configuration from the dataclasses when the site is built."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import re
+from typing import Any
+
+import docstring_parser
+
+from ssa_nerfstudio.cli import COMMANDS
+
+OWN = {
+    "Model": ("ssa_nerfstudio.plugin.model", "SSASplatfactoModelConfig", "--pipeline.model."),
+    "Photos": ("ssa_nerfstudio.plugin.datamanager", "SSADatamanagerConfig", "--pipeline.datamanager."),
+    "Training": ("ssa_nerfstudio.plugin.trainer", "SSATrainerConfig", "--"),
+}
+"""Heading: module, dataclass and the prefix of its options."""
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Put the generated part where a page asks for it.
+
+    Raises:
+        RuntimeError: a field has no docstring, which would leave a hole in the reference.
+    """
+    if "<!-- commands -->" in markdown:
+        markdown = markdown.replace("<!-- commands -->", "\n".join(map(_command, COMMANDS)))
+    if "<!-- configuration -->" in markdown:
+        markdown = markdown.replace("<!-- configuration -->", "\n".join(_configuration(name) for name in OWN))
+    return markdown
+
+
+def _command(name: str) -> str:
+    command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+    rows = [(_option(field.name), field, text) for field, text in _fields(command)]
+    return f"## `ssa {name}`\n\n{COMMANDS[name]}\n\n{_table(rows)}"
+
+
+def _configuration(heading: str) -> str:
+    module, name, prefix = OWN[heading]
+    config = getattr(importlib.import_module(module), name)
+    rows = [(_option(field.name, prefix), field, text) for field, text in _fields(config)]
+    return f"## {heading}\n\n{_table(rows)}"
+
+
+def _option(name: str, prefix: str = "--") -> str:
+    return prefix + name.replace("_", "-")
+
+
+def _fields(cls: type) -> list[tuple[dataclasses.Field, str]]:
+    """The fields that a class itself declares, with their docstrings."""
+    texts = {p.arg_name: p.description for p in docstring_parser.parse_from_object(cls).params}
+    declared = [f for f in dataclasses.fields(cls) if f.name in vars(cls)["__annotations__"] and f.name[0] != "_"]
+    missing = [f.name for f in declared if not texts.get(f.name)]
+    if missing:
+        raise RuntimeError(f"{cls.__name__}: no docstring under {', '.join(missing)}")
+    return [(field, texts[field.name] or "") for field in declared]
+
+
+def _table(rows: list[tuple[str, dataclasses.Field, str]]) -> str:
+    lines = ["| option | type | default | |", "|---|---|---|---|"]
+    for option, field, text in rows:
+        cells = (f"`{option}`", f"`{_type(field)}`", _default(field), text)
+        lines.append("| " + " | ".join(re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in cells) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _type(field: dataclasses.Field) -> str:
+    return field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
+
+
+def _default(field: dataclasses.Field) -> str:
+    if field.default is not dataclasses.MISSING:
+        if field.name == "threads":
+            return "the machine's cores"
+        return f"`{field.default}`"
+    return "required" if field.default_factory is dataclasses.MISSING else ""

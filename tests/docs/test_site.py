@@ -1,0 +1,68 @@
+"""The documentation: every command and every option is in it, and the site builds without a warning."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ssa_nerfstudio.cli import COMMANDS
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory) -> Path:
+    pytest.importorskip("material", reason="mkdocs-material is not installed; pip install -e '.[dev]'")
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-W", "ignore", "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", folder]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    )
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_every_command_and_its_options_are_in_the_site(site):
+    page = (site / "commands.html").read_text()
+    assert all(f"<code>ssa {name}</code>" in page for name in COMMANDS)
+    assert "<code>--raw-frame</code>" in page
+
+
+def test_every_setting_of_the_model_is_in_the_site(site):
+    page = (site / "configuration.html").read_text()
+    for name in ("overlay-given", "sparsity-weight", "cap-max", "ignore-background"):
+        assert f"<code>--pipeline.model.{name}</code>" in page
+
+
+def test_the_site_fetches_nothing_from_the_internet(site):
+    for page in site.glob("*.html"):
+        assert 'src="http' not in page.read_text()
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_help_explains_every_option(name, capsys):
+    import dataclasses
+    import importlib
+
+    from ssa_nerfstudio.cli import main
+
+    with pytest.raises(SystemExit) as caught:
+        main([name, "--help"])
+    assert caught.value.code == 0
+    text = capsys.readouterr().out
+    command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+    assert all("--" + field.name.replace("_", "-") in text for field in dataclasses.fields(command))
+
+
+@pytest.mark.parametrize("name", sorted(COMMANDS))
+def test_a_wrong_flag_ends_with_exit_code_2(name, capsys):
+    from ssa_nerfstudio.cli import main
+
+    with pytest.raises(SystemExit) as caught:
+        main([name, "--no-such-option", "1"])
+    assert caught.value.code == 2
+    assert "no-such-option" in capsys.readouterr().err
