@@ -139,10 +139,15 @@ def _subjects(results: list[Result]) -> list[Subject]:
     for result in results:
         key = (result.run.scene, result.run.effect, result.versions.get("device", "?"))
         keys.setdefault(key, []).append(Curve(result))
-    return [
-        Subject(*key, sorted(curves, key=lambda c: (len(c.knobs), c.knobs, c.setting, c.result.run.seed)))
-        for key, curves in sorted(keys.items())
+    return [Subject(*key, sorted(curves, key=_order)) for key, curves in sorted(keys.items())]
+
+
+def _order(curve: Curve) -> tuple:
+    """Few knobs before many, numbers by size."""
+    values = [
+        (0, v, "") if isinstance(v, (int, float)) else (1, 0, str(v)) for v in curve.result.run.variation.values()
     ]
+    return len(curve.knobs), curve.knobs, values, curve.result.run.seed
 
 
 def _section(subject: Subject, figure: Path) -> Section:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,23 +21,31 @@ if TYPE_CHECKING:
 
 COLUMNS = 3
 """Panels of knobs in a row."""
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f00", "#8c564b")
-"""Okabe and Ito's, which most colour-blind people tell apart, and two more."""
+TOGETHER = "several together"
+COLOURS = (
+    *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
+    *("#7f7f00", "#8c564b", "#17becf", "#4d4d4d", "#8a2be2", "#bcbd22"),
+)
+"""Okabe and Ito's, which most colour-blind people tell apart, and some more."""
 
 
 def draw(subject: Subject, folder: Path) -> list[Path]:
     """Writes NAME.png and NAME.svg; the two files, PNG first."""
     knobs = sorted({curve.knobs[0] for curve in subject.curves if len(curve.knobs) == 1})
     together = any(len(curve.knobs) > 1 for curve in subject.curves)
-    panels = [*knobs, *(["several together"] if together else [])]
-    rows = math.ceil(len(panels) / COLUMNS)
-    figure = plt.figure(figsize=(11, 5 + 2.9 * rows), layout="constrained")
-    grid = figure.add_gridspec(1 + rows, COLUMNS, height_ratios=[1.7, *([1] * rows)])
+    rows = math.ceil(len(knobs) / COLUMNS)
+    figure = plt.figure(figsize=(11, 5 + 2.9 * (rows + together)), layout="constrained")
+    grid = figure.add_gridspec(1 + rows + together, COLUMNS, height_ratios=[1.7, *([1] * (rows + together))])
     top = figure.add_subplot(grid[0, :])
     _overview(top, subject)
-    for number, name in enumerate(panels):
+    for number, name in enumerate(knobs):
         axes = figure.add_subplot(grid[1 + number // COLUMNS, number % COLUMNS], sharex=top, sharey=top)
         _panel(axes, subject, name)
+    if together:
+        axes = figure.add_subplot(grid[-1, :2], sharex=top, sharey=top)
+        _panel(axes, subject, TOGETHER)
+        legend = axes.legend(fontsize=7, frameon=False, loc="upper left", bbox_to_anchor=(1.01, 1.0))
+        legend.set_in_layout(False)
     paths = [folder / f"{subject.name}.{kind}" for kind in ("png", "svg")]
     for path in paths:
         figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else None)
@@ -63,6 +72,7 @@ def _overview(axes: Axes, subject: Subject) -> None:
             textcoords="offset points",
             verticalalignment="top",
             color="#a04000",
+            bbox={"boxstyle": "round", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
             arrowprops={"arrowstyle": "-", "color": "#d55e00"},
         )
     axes.plot([], [], color="0.75", marker=".", label="every run, from first to last evaluation")
@@ -70,7 +80,7 @@ def _overview(axes: Axes, subject: Subject) -> None:
         label = "shared its device: seconds too long, on no frontier"
         axes.plot([], [], color="0.75", marker=".", linestyle=":", label=label)
     axes.set_xscale("log")
-    axes.xaxis.set_major_locator(LogLocator(10, (1, 2, 5)))
+    axes.xaxis.set_major_locator(LogLocator(10, (1, 3)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _seconds(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
     axes.set_title(f"What accuracy costs: {subject.scene} behind {subject.effect}, on {subject.device}")
@@ -83,7 +93,7 @@ def _overview(axes: Axes, subject: Subject) -> None:
 def _panel(axes: Axes, subject: Subject, name: str) -> None:
     """The runs that vary one knob, or several, coloured, before all others."""
     chosen = [c for c in subject.curves if not c.knobs or c.knobs == (name,)]
-    if name == "several together":
+    if name == TOGETHER:
         chosen = [c for c in subject.curves if len(c.knobs) != 1]
     for curve in subject.curves:
         _line(axes, curve, color="0.88", linewidth=1)
@@ -92,9 +102,10 @@ def _panel(axes: Axes, subject: Subject, name: str) -> None:
         label = curve.setting.removeprefix(f"{name} ")
         fresh = label not in labelled
         colour = labelled.setdefault(label, COLOURS[len(labelled) % len(COLOURS)])
-        _line(axes, curve, color=colour, marker="o", markersize=3, label=label if fresh else None)
+        _line(axes, curve, color=colour, marker="o", markersize=3, label=textwrap.fill(label, 44) if fresh else None)
     axes.set_title(name, fontsize=10)
-    axes.legend(fontsize=7, frameon=False, loc="lower right")
+    # Long names must not squeeze the panels.
+    axes.legend(fontsize=7, frameon=False, loc="lower right").set_in_layout(False)
     axes.tick_params(labelsize=8)
     axes.grid(alpha=0.2)
 
