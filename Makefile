@@ -3,6 +3,7 @@
 #   make demo DATA=folder      the same comparison on your nerfstudio dataset
 #   make docs                  the documentation as a site, in site/
 #   make test, make lint       what .ci/run runs, with make docs
+#   make stability             every hard case, the long ones too (docs/stability.md)
 
 VENV := .venv
 READY := $(VENV)/.ready
@@ -13,7 +14,7 @@ PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3 python; do \
 DATA ?=
 DEMO_OPTIONS ?=
 
-.PHONY: setup demo docs test lint format clean
+.PHONY: setup demo docs test stability lint format clean
 
 setup: $(READY)
 
@@ -33,6 +34,9 @@ docs: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+stability: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "stability or not stability" tests/stability tests/plugin/test_guards.py tests/plugin/test_checkpoints.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

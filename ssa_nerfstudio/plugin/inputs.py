@@ -91,6 +91,12 @@ def check_transforms(data: Path) -> None:
         photo = path.parent / str(name)
         if not photo.exists() and not list(path.parent.glob(f"{photo.parent.name}_*/{photo.name}")):
             raise refuse(f"{path} names {name}, which does not exist; put the photo there or remove the frame")
+    positions = np.array([np.array(frame["transform_matrix"], dtype=float)[:3, 3] for frame in frames])
+    if (positions == positions[0]).all():
+        raise refuse(
+            f"{path}: all cameras are in one place, from which no depth can be seen; move the camera between photos, "
+            "or register them again"
+        )
 
 
 def check_views(outputs: DataparserOutputs, source: Path) -> None:

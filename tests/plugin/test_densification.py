@@ -152,3 +152,44 @@ def test_covariances_on_a_cpu_are_rotated_squared_scales():
     covars, _ = ops.quat_scale_to_covar_preci(quats, scales, compute_preci=False)
     assert covars is not None
     torch.testing.assert_close(covars[0], torch.diag(torch.tensor([4.0, 1.0, 9.0])), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("opacity", [-9.0, float("nan")])
+@pytest.mark.parametrize("guarded", [True, False])
+def test_relocation_with_nobody_alive_or_with_nan_fails_without_the_guard(opacity, guarded):
+    params, optimizers = gaussians(30)
+    params["opacities"].data[:] = -9.0
+    params["opacities"].data[1:] = opacity
+    strategy = MarkovChainMonteCarlo(refine_start_iter=0, refine_every=1, guarded=guarded)
+    if guarded:
+        strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {})
+        assert all(torch.isfinite(p).all() for p in params.values())
+        assert (torch.sigmoid(params["opacities"]) > strategy.min_opacity).any()
+    else:
+        with pytest.raises(RuntimeError):
+            strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, {})
+
+
+@pytest.mark.parametrize("guarded", [True, False])
+def test_pruning_leaves_a_scene_only_with_the_guard(guarded):
+    params, optimizers = gaussians(30)
+    params["opacities"].data[:] = -9.0
+    strategy = AdaptiveDensityControl(
+        refine_start_iter=0, refine_every=1, pause_refine_after_reset=0, guarded=guarded, grow_grad2d=1e9
+    )
+    strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, rendered(30, 0, False))
+    assert len(params["means"]) == (30 if guarded else 0)
+
+
+def test_noise_is_left_out_of_a_skipped_step():
+    moved = []
+    for skipped in (0.0, 1.0):
+        params, optimizers = gaussians(30)
+        params["opacities"].data[:] = -6.0
+        before = params["means"].detach().clone()
+        strategy = MarkovChainMonteCarlo(refine_start_iter=100)
+        info = {"skipped": torch.tensor(skipped)}
+        strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, info)
+        moved.append((params["means"] - before).abs().max().item())
+    assert moved[0] > 0
+    assert moved[1] == 0

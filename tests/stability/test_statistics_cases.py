@@ -1,0 +1,215 @@
+"""Hard cases of the statistics of a capture and of the overlay that starts from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from hard_cases import Case, Family
+from torch import Tensor
+
+from ssa_nerfstudio.overlay.detection import detect
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
+
+STATISTICS = Family("Statistics and start")
+SIZE = (6, 8, 3)
+
+
+def photos(views: int, size: tuple[int, int, int] = SIZE, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (views, *size), dtype=np.uint8)
+
+
+def started(statistics: ImageStatistics, resolution: int = 1) -> ScreenSpaceOverlay:
+    """An overlay that starts from the statistics and is usable: finite, its matte in range, its gradients alive."""
+    overlay = ScreenSpaceOverlay(*statistics.size, resolution)
+    overlay.start_from(statistics)
+    transmittance, addition = overlay.layers()
+    (transmittance.sum() + addition.sum()).backward()
+    for parameter in overlay.parameters():
+        assert torch.isfinite(parameter).all()
+        assert parameter.grad is not None
+        assert torch.isfinite(parameter.grad).all()
+    assert overlay.alpha_logits.grad is not None
+    assert (overlay.alpha_logits.grad != 0).all()
+    assert torch.isfinite(overlay.evidence).all()
+    assert 0 <= overlay.evidence.min() <= overlay.evidence.max() <= 1
+    assert 0.0099 <= overlay.matte().min() <= overlay.matte().max() <= 0.9901
+    return overlay
+
+
+def stream(images: np.ndarray | list, masks: list | None = None) -> ImageStatistics:
+    masks = masks or [None] * len(images)
+    return accumulate(
+        (torch.from_numpy(np.asarray(image)), None if mask is None else torch.from_numpy(mask))
+        for image, mask in zip(images, masks, strict=True)
+    )
+
+
+def exact(images: np.ndarray, full: float) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and largest deviation in float64, in two passes."""
+    values = images.astype(np.float64) / full
+    return values.mean(axis=0), values.std(axis=0).max(axis=-1, keepdims=True)
+
+
+@STATISTICS.case("one photo many times", "exp(-0) is exactly 1, whose logit is infinite.")
+def _() -> None:
+    overlay = started(stream([photos(1)[0]] * 9))
+    torch.testing.assert_close(overlay.matte(), torch.full((6, 8, 1), 0.99))
+
+
+@STATISTICS.case("black photos", "A mean of 0 has a logit of minus infinity.", 0)
+@STATISTICS.case("white photos", "A mean of 1 has a logit of infinity.", 255)
+def _flat(value: int) -> None:
+    overlay = started(stream(np.full((5, *SIZE), value, np.uint8)))
+    assert (overlay.color() - value / 255).abs().max() < 1 / 500
+
+
+@STATISTICS.case("one bit of noise", "E[x^2] - E[x]^2 in float32 would be rounding error, or negative.", 200)
+@STATISTICS.case("one bit of noise on black", "The smallest deviation there is must not vanish.", 0)
+def _bit(base: int) -> None:
+    noisy = np.full((40, *SIZE), base, np.uint8) + (photos(40) % 2)
+    statistics = stream(noisy)
+    np.testing.assert_allclose(statistics.deviation().numpy(), exact(noisy, 255)[1], rtol=1e-12)
+    started(statistics)
+
+
+@STATISTICS.case("two views", "The fewest views there can be: a deviation over n - 1 would be over 1.")
+def _() -> None:
+    pair = photos(2)
+    np.testing.assert_allclose(stream(pair).deviation().numpy(), exact(pair, 255)[1], rtol=1e-12)
+    started(stream(pair))
+
+
+@STATISTICS.case("a single view", "It agrees with itself everywhere and would make the whole photo an artifact.")
+def _() -> None:
+    assert started(stream(photos(1))).matte().max() < 0.011
+
+
+@STATISTICS.case("10000 views of 8 bits", "Sums of squares exceed 32 bits, or float32 stops counting at 16 million.")
+def _() -> None:
+    statistics = ImageStatistics()
+    ramp = np.arange(10_000) % 256
+    for value in ramp:
+        statistics.add(torch.full(SIZE, int(value), dtype=torch.uint8))
+    np.testing.assert_allclose(statistics.mean().numpy(), ramp.mean() / 255, rtol=1e-12)
+    np.testing.assert_allclose(statistics.deviation().numpy(), ramp.std() / 255, rtol=1e-12)
+    started(statistics)
+
+
+@STATISTICS.case("10000 white views", "The largest sums that 8 bits give: an overflow would show as a deviation.")
+def _() -> None:
+    statistics = ImageStatistics()
+    white = torch.full((2, 3, 3), 255, dtype=torch.uint8)
+    for _ in range(10_000):
+        statistics.add(white)
+    assert statistics.deviation().max() == 0
+    assert statistics.mean().min() == 1
+
+
+@STATISTICS.case("photos of 16 bits", "Squares of 16 bits exceed 32 bits at the second photo.")
+def _() -> None:
+    deep = np.random.default_rng(1).integers(0, 65536, (300, *SIZE), dtype=np.uint16)
+    statistics = stream(deep)
+    mean, deviation = exact(deep, 65535)
+    np.testing.assert_allclose(statistics.mean().numpy(), mean, rtol=1e-12)
+    np.testing.assert_allclose(statistics.deviation().numpy(), deviation, rtol=1e-12)
+    started(statistics)
+
+
+@STATISTICS.case("photos in floating point", "Their deviation must be that of the photos in 8 bits.", 1.0)
+@STATISTICS.case("floating point and almost no noise", "1e-4 of noise on 0.9 is lost in float32.", 1e-4)
+def _float(noise: float) -> None:
+    values = (0.9 - noise * np.random.default_rng(2).random((50, *SIZE)) * 0.9).astype(np.float32)
+    statistics = stream(values)
+    np.testing.assert_allclose(statistics.deviation().numpy(), exact(values, 1.0)[1], rtol=1e-6)
+    started(statistics)
+
+
+@STATISTICS.case("a hot pixel", "A sensor's hot pixel is static and is to become artifact; its neighbours are not.")
+def _() -> None:
+    noisy = photos(60)
+    noisy[:, 3, 4] = 255
+    matte = started(stream(noisy)).matte()[..., 0]
+    assert matte[3, 4] > 0.98
+    matte[3, 4] = 0
+    assert matte.max() < 0.05
+
+
+@STATISTICS.case("masks that cover all", "Sums over no view: a mean of 0 / 0 and a matte of 1.", 0)
+@STATISTICS.case("masks that leave one view", "A pixel seen once agrees with itself and would become artifact.", 1)
+def _masks(seen: int) -> None:
+    masks = [np.full(SIZE[:2], k < seen) for k in range(5)]
+    statistics = stream(photos(5), masks)
+    assert (statistics.views == seen).all()
+    assert started(statistics).matte().max() < 0.011
+
+
+@STATISTICS.case("masks of half the frame", "What is masked must not change what is seen.")
+def _() -> None:
+    images, mask = photos(7), np.zeros(SIZE[:2], bool)
+    mask[:, :4] = True
+    spoilt = images.copy()
+    spoilt[:, :, 4:] = photos(7, seed=9)[:, :, 4:]
+    a, b = (started(stream(part, [mask] * 7)) for part in (images, spoilt))
+    assert torch.equal(a.matte(), b.matte())
+    assert torch.equal(a.color(), b.color())
+
+
+@STATISTICS.case("a frame of one pixel", "No window, no edge and no neighbour exists.", (1, 1, 3))
+@STATISTICS.case("a frame of one row", "Gradients across rows do not exist.", (1, 9, 3))
+@STATISTICS.case("a frame of one column", "Gradients along rows do not exist.", (9, 1, 3))
+def _small(size: tuple[int, int, int]) -> None:
+    started(stream(photos(12, size)))
+
+
+@STATISTICS.case(
+    "an odd frame at half resolution", "The last column has half a block and would be averaged with nothing.", 2
+)
+@STATISTICS.case("an odd frame at a quarter", "Three quarters of the last block are missing.", 4)
+def _reduced(resolution: int) -> None:
+    overlay = started(stream(np.full((3, 7, 9, 3), 100, np.uint8)), resolution)
+    assert (overlay.color() - 100 / 255).abs().max() < 1e-5
+
+
+@STATISTICS.case(
+    "frames of two sizes", "A photo of another size would be summed into the wrong pixels.", torch.zeros(5, 8, 3)
+)
+@STATISTICS.case(
+    "photos of two depths", "0 to 255 and 0 to 65535 would be added.", torch.zeros(SIZE, dtype=torch.uint16)
+)
+def _mixed(stranger: Tensor) -> None:
+    statistics = stream(photos(2))
+    before = statistics.mean()
+    try:
+        statistics.add(stranger.to(torch.uint8) if stranger.dtype == torch.float32 else stranger)
+    except ValueError:
+        assert torch.equal(statistics.mean(), before)
+    else:
+        raise AssertionError("it was taken")
+
+
+@STATISTICS.case("almost everything static", "The 70th percentile of sigma is 0, and evidence is divided by it.")
+def _() -> None:
+    images = np.repeat(photos(1), 20, axis=0)
+    images[:, 0, 0] = photos(20)[:, 0, 0]
+    started(stream(images))
+
+
+SCENE = (24, 32, 3)
+
+
+@STATISTICS.case(
+    "evidence of one photo many times", "Mean gradients over a standard error of 0.", np.repeat(photos(1, SCENE), 8, 0)
+)
+@STATISTICS.case("evidence of black photos", "No gradient at all is 0 / 0.", np.zeros((8, *SCENE), np.uint8))
+@STATISTICS.case("evidence of two views", "The standard error of two numbers.", photos(2, SCENE))
+def _detected(images: np.ndarray) -> None:
+    found = detect(stream(images), draws=20)
+    numbers = {name: value for name, value in vars(found).items() if isinstance(value, float)}
+    assert numbers
+    assert all(np.isfinite(value) for value in numbers.values()), numbers
+
+
+@STATISTICS.parametrize
+def test_statistics_and_start(case: Case) -> None:
+    case.check()

@@ -1,0 +1,277 @@
+"""Hard cases of whole trainings: everything stays finite, and what a user could meet has a sane result."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hard_cases import Case, Family
+from PIL import Image
+from plyfile import PlyData
+
+from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
+from ssa_nerfstudio.demo.scene import DemoScene
+from ssa_nerfstudio.effects.layers import Layers
+from ssa_nerfstudio.errors import BadInput
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+
+TRAINING = Family("Whole training")
+SIDE = (48, 64)
+Edit = Callable[[Path], None]
+
+
+def dataset(folder: Path, artifact: Layers | None = None, edit: Edit | None = None, views: int = 8) -> Path:
+    """A small capture, changed by `edit`."""
+    DemoScene(views=views, test_views=2, width=SIDE[1], height=SIDE[0]).write(folder, artifact)
+    if edit is not None:
+        edit(folder)
+    return folder
+
+
+def opaque(share: float) -> Layers:
+    """An opaque orange over the lower part of the frame."""
+    matte = np.zeros(SIDE, np.float32)
+    matte[round(SIDE[0] * (1 - share)) :] = 1
+    return Layers.composited(matte, np.broadcast_to(np.array([0.9, 0.5, 0.1], np.float32), (*SIDE, 3)))
+
+
+def train(data: Path, steps: int = 25, method: str = "ssa-splatfacto", rates: float = 1.0, auto_scale=True, **model):
+    """Train and check that everything stayed finite: every step's loss, the parameters, the metrics."""
+    config = configure(method, data, data.parent / "runs", steps, {"num_downscales": 0, **model})
+    config.pipeline.datamanager.dataparser.auto_scale_poses = auto_scale  # pyright: ignore
+    config.pipeline.model.max_skipped_steps = 1  # a single skipped step is a failure here
+    for entry in config.optimizers.values():
+        entry["optimizer"].lr *= rates
+        if entry["scheduler"] is not None and entry["scheduler"].lr_final is not None:
+            entry["scheduler"].lr_final *= rates
+    outcome, pipeline, _ = train_and_evaluate(config)
+    assert torch.isfinite(pipeline.loss)
+    for name, parameter in pipeline.model.named_parameters():
+        assert torch.isfinite(parameter).all(), name
+    finite = {name: value for name, value in outcome.metrics.items() if not name.endswith("_std")}
+    assert all(np.isfinite(value) for value in finite.values()), finite
+    assert pipeline.model.num_points > 0
+    return outcome, pipeline.model
+
+
+def repaint(value: int) -> Edit:
+    def edit(folder: Path) -> None:
+        for path in (folder / "images").iterdir():
+            Image.fromarray(np.full((*SIDE, 3), value, np.uint8)).save(path)
+
+    return edit
+
+
+def transforms(change: Callable[[dict[str, Any]], None]) -> Edit:
+    def edit(folder: Path) -> None:
+        path = folder / "transforms.json"
+        content = json.loads(path.read_text())
+        change(content)
+        path.write_text(json.dumps(content))
+
+    return edit
+
+
+def scaled(factor: float) -> Edit:
+    """The whole world times a factor: cameras and points."""
+
+    def change(content: dict[str, Any]) -> None:
+        for frame in content["frames"]:
+            for row in frame["transform_matrix"][:3]:
+                row[3] *= factor
+
+    def edit(folder: Path) -> None:
+        transforms(change)(folder)
+        points(lambda xyz: xyz * factor)(folder)
+
+    return edit
+
+
+def points(change: Callable[[np.ndarray], np.ndarray]) -> Edit:
+    """The points the dataset starts from, [N, 3], changed."""
+
+    def edit(folder: Path) -> None:
+        path = folder / "sparse_pc.ply"
+        ply = PlyData.read(str(path))
+        vertex = ply["vertex"]
+        xyz = change(np.stack([vertex[axis] for axis in "xyz"], axis=1))
+        vertex.data = vertex.data[: len(xyz)].copy()
+        for axis, values in zip("xyz", xyz.T, strict=True):
+            vertex.data[axis] = values
+        ply.write(str(path))
+
+    return edit
+
+
+def same_pose(content: dict[str, Any]) -> None:
+    for frame in content["frames"]:
+        frame["transform_matrix"] = content["frames"][0]["transform_matrix"]
+
+
+def two_views(content: dict[str, Any]) -> None:
+    content["train_filenames"] = content["train_filenames"][:2]
+
+
+def same_photo(folder: Path) -> None:
+    paths = sorted((folder / "images").iterdir())
+    for path in paths[1:]:
+        path.write_bytes(paths[0].read_bytes())
+
+
+def matte_of(model: SSASplatfactoModel) -> torch.Tensor:
+    return model.artifacts.learned()[0].matte().detach()[..., 0]
+
+
+for _share in (1.0, 0.6, 0.3):
+    for _overlay in ("on", "off"):
+
+        @TRAINING.case(
+            f"an opaque artifact over {_share:.0%} of the frame, overlay {_overlay}",
+            "Behind it the scene loses its gradient, or all of it dies.",
+            _share,
+            _overlay,
+        )
+        def _covered(share: float, overlay: str, folder: Path) -> None:
+            _, model = train(dataset(folder / "scene", opaque(share)), overlay=overlay)
+            if overlay == "on":
+                boundary = round(SIDE[0] * (1 - share))
+                assert matte_of(model)[boundary + 1 :].mean() > 0.9
+                assert boundary == 0 or matte_of(model)[: max(1, boundary - 1)].mean() < 0.5
+
+
+@TRAINING.case("black photos", "Colours of 0, an SSIM of 0 over 0, a mean of 0.", 0)
+@TRAINING.case("white photos", "Colours of 1, and a background that explains everything.", 255)
+def _flat(value: int, folder: Path) -> None:
+    outcome, _ = train(dataset(folder / "scene", edit=repaint(value)))
+    assert outcome.metrics["composite_psnr"] > 15
+
+
+@TRAINING.case(
+    "one photo from every side", "Everything is static: all of it is artifact, and nothing is left to be scene."
+)
+def _(folder: Path) -> None:
+    _, model = train(dataset(folder / "scene", edit=same_photo))
+    assert matte_of(model).mean() > 0.9
+
+
+@TRAINING.case("two views", "The fewest there can be.")
+def _(folder: Path) -> None:
+    train(dataset(folder / "scene", edit=transforms(two_views)))
+
+
+@TRAINING.case("poses all equal", "Normalising the scene divides by the largest distance of a camera, 0.")
+def _(folder: Path) -> None:
+    with pytest.raises(BadInput, match="all cameras are in one place"):
+        train(dataset(folder / "scene", edit=transforms(same_pose)))
+
+
+@TRAINING.case("cameras a millionth apart", "The cameras' extent is next to 0, and sizes are measured in it.")
+def _(folder: Path) -> None:
+    def change(content: dict[str, Any]) -> None:
+        same_pose(content)
+        content["frames"] = json.loads(json.dumps(content["frames"]))
+        for number, frame in enumerate(content["frames"]):
+            frame["transform_matrix"][0][3] += 1e-6 * number
+
+    train(dataset(folder / "scene", edit=transforms(change)), method="ssa-splatfacto-paper")
+
+
+for _factor in (1e-3, 1e3):
+
+    @TRAINING.case(f"a scene of {_factor:g} times the size", "Normalising it must give the usual scene.", _factor)
+    def _world(factor: float, folder: Path) -> None:
+        outcome, _ = train(dataset(folder / "scene", edit=scaled(factor)))
+        assert outcome.metrics["psnr"] > 10
+
+    @TRAINING.case(
+        f"a scene of {_factor:g} times the size, not normalised",
+        "Depths below the near plane, or steps a thousandth of what they should be.",
+        _factor,
+    )
+    def _raw(factor: float, folder: Path) -> None:
+        train(dataset(folder / "scene", edit=scaled(factor)), auto_scale=False)
+
+
+for _method in ("ssa-splatfacto", "ssa-splatfacto-mcmc"):
+    for _overlay in ("on", "off"):
+
+        @TRAINING.case(
+            f"learning rates times ten, {_method}, overlay {_overlay}",
+            "Scales and opacities run away.",
+            _method,
+            _overlay,
+        )
+        def _fast(method: str, overlay: str, folder: Path) -> None:
+            train(dataset(folder / "scene", opaque(0.3)), 40, method, rates=10, overlay=overlay)
+
+
+@TRAINING.case(
+    "points all in one place", "No distance to a neighbour: a log scale of minus infinity.", lambda xyz: 0 * xyz
+)
+@TRAINING.case("two points", "Fewer than the neighbours that a size is made of.", lambda xyz: xyz[:2])
+@TRAINING.case("a single point", "No neighbour at all.", lambda xyz: xyz[:1])
+@TRAINING.case("no points", "Nothing to start from.", lambda xyz: xyz[:0])
+@TRAINING.case(
+    "points that are not finite",
+    "One NaN spoils the search for neighbours.",
+    lambda xyz: np.where(np.arange(len(xyz))[:, None] % 7 == 0, np.nan, xyz),
+)
+@TRAINING.case(
+    "a point 1e6 away",
+    "Its size is 1e6, and the others' depths lose their digits.",
+    lambda xyz: np.where(np.arange(len(xyz))[:, None] == 0, 1e6, xyz),
+)
+def _points(change: Callable[[np.ndarray], np.ndarray], folder: Path) -> None:
+    train(dataset(folder / "scene", edit=points(change)), num_random=500)
+
+
+@TRAINING.case("photos smaller than SSIM's window", "Reduced photos have no window left.")
+def _(folder: Path) -> None:
+    DemoScene(views=6, test_views=2, width=40, height=30).write(folder / "scene", None)
+    config = configure(
+        "ssa-splatfacto", folder / "scene", folder / "runs", 10, {"num_downscales": 2, "resolution_schedule": 30_000}
+    )
+    _, pipeline, _ = train_and_evaluate(config)
+    assert all(torch.isfinite(p).all() for p in pipeline.model.parameters())
+
+
+@TRAINING.case("MCMC that starts below its smallest opacity", "Everything is dead at the first relocation.")
+def _(folder: Path) -> None:
+    train(dataset(folder / "scene"), 40, "ssa-splatfacto-mcmc", mcmc_opacity_start=0.002, warmup_length=1)
+
+
+for _guards in (True, False):
+    for _overlay in ("on", "off"):
+
+        @TRAINING.case(
+            f"MCMC behind a dashboard on fox, overlay {_overlay}, guards {'on' if _guards else 'off'}",
+            "The paper's baseline diverges there.",
+            _overlay,
+            _guards,
+            slow=True,
+        )
+        def _fox(overlay: str, guards: bool, folder: Path) -> None:
+            import os
+
+            from ssa_nerfstudio.cli import main
+
+            capture = Path(os.environ.get("SSA_DATA", "data")) / "fox"
+            if not capture.exists():
+                pytest.skip("set SSA_DATA to the folder of real captures")
+            main(["simulate", "--data", str(capture), "--output", str(folder / "fox"), "--effects", "dashboard"])
+            model = {"overlay": overlay, "guards": guards, "num_downscales": 0, "cap_max": 20_000}
+            config = configure("ssa-splatfacto-mcmc", folder / "fox", folder / "runs", 1000, model, 0.125)
+            outcome, pipeline, _ = train_and_evaluate(config)
+            assert all(torch.isfinite(p).all() for p in pipeline.model.parameters())
+            assert torch.exp(pipeline.model.scales).max() < 100
+            assert np.isfinite(outcome.metrics["psnr"])
+
+
+@TRAINING.parametrize
+def test_whole_training(case: Case, tmp_path: Path) -> None:
+    case.check(tmp_path)
