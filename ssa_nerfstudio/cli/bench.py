@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 class Command:
     """Train and score scenes x effects x methods x seeds; go on where an earlier call stopped."""
 
-    benchmark: Annotated[str, tyro.conf.Positional]
-    """smoke, captures, mipnerf360, two-pass, or a .yaml file."""
     output: Path
     """Folder of the results; an earlier one is brought up to date, a finished run is never repeated."""
+    benchmark: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="BENCHMARK")] = "smoke"
+    """smoke, captures, captures-cpu, mipnerf360, two-pass, or a .yaml file."""
     scenes: tuple[str, ...] = ()
     """Only these scenes."""
     only: tuple[str, ...] = ()
