@@ -1,0 +1,131 @@
+"""Does MCMC diverge behind an artifact, when, and by which parameter? `python -m ssa_nerfstudio.benchmark.divergence`
+
+Trains the same dataset four times, with the overlay and the guards off and on, and writes divergence.json and
+divergence.png: the largest scale, the share of living Gaussians and the norm of all gradients over the steps.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils import writer
+
+from ssa_nerfstudio.benchmark.run import configure, versions
+from ssa_nerfstudio.errors import TrainingFailed
+from ssa_nerfstudio.plugin.trainer import SSATrainer
+
+ALIVE = 0.005
+"""Opacity above which a Gaussian lives (MCMC's smallest)."""
+PANELS = {"largest scale": "world units", "alive share": "of all Gaussians", "gradient norm": "2-norm of all gradients"}
+
+
+@dataclass
+class Command:
+    """Train four times and plot."""
+
+    data: Path
+    """A nerfstudio dataset with an artifact in front (`ssa simulate --effects dashboard`)."""
+    output: Path
+    """Folder for divergence.json, divergence.png and the runs."""
+    steps: int = 15_000
+    """Training steps of each run; schedules are scaled to them."""
+    cap_max: int = 300_000
+    """The largest number of Gaussians."""
+    scale_factor: float = 1.0
+    """Photos are resized by this."""
+    every: int = 10
+    """Steps between two notes."""
+
+    def run(self) -> None:
+        """Train, write, draw."""
+        self.output.mkdir(parents=True, exist_ok=True)
+        runs = {}
+        for overlay in ("off", "on"):
+            for guards in (False, True):
+                name = f"overlay {overlay}, guards {'on' if guards else 'off'}"
+                runs[name] = self._train(overlay, guards)
+                print(f"{name}: {runs[name]['verdict']}")
+                asked = {"data": self.data.name, "steps": self.steps, "cap_max": self.cap_max, "every": self.every}
+                content = {**asked, "versions": versions(), "runs": runs}
+                (self.output / "divergence.json").write_text(json.dumps(content) + "\n")
+        draw(runs, self.output / "divergence.png")
+
+    def _train(self, overlay: str, guards: bool) -> dict[str, Any]:
+        model = {"overlay": overlay, "guards": guards, "cap_max": self.cap_max}
+        config = configure("ssa-splatfacto-mcmc", self.data, self.output / "runs", self.steps, model, self.scale_factor)
+        random.seed(0)
+        np.random.seed(0)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
+        torch.manual_seed(0)
+        config.set_timestamp()
+        config.viewer.quit_on_train_completion = True
+        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        names, notes = list(trainer.pipeline.model.gauss_params), []
+
+        @torch.no_grad()
+        def note(step: int) -> None:
+            if step % self.every:
+                return
+            params = trainer.pipeline.model.gauss_params
+            squares = torch.stack([p.grad.square().sum() for p in params.values() if p.grad is not None])
+            finite = [torch.isfinite(p).all().float() for p in params.values()]
+            alive = (torch.sigmoid(params["opacities"]) > ALIVE).float().mean()
+            notes.append(torch.stack([params["scales"].max().exp(), alive, squares.sum().sqrt(), *finite]))
+
+        # Before the densification, which puts new parameters without gradients in the place of these.
+        trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
+        failure = None
+        try:
+            trainer.train()
+        except TrainingFailed as failed:
+            failure = str(failed)
+        finally:
+            writer.EVENT_WRITERS.clear()
+            writer.EVENT_STORAGE.clear()
+            writer.GLOBAL_BUFFER.clear()
+        table = torch.stack(notes).cpu().numpy().astype(float)
+        steps = (np.arange(len(table)) * self.every).tolist()
+        series = {name: [v if math.isfinite(v) else None for v in table[:, k]] for k, name in enumerate(PANELS)}
+        broken = table[:, len(PANELS) :] == 0
+        verdict = "it does not diverge"
+        if broken.any():
+            first = int(broken.any(axis=1).argmax())
+            which = ", ".join(name for name, is_broken in zip(names, broken[first], strict=True) if is_broken)
+            verdict = f"{which} first not finite at step {steps[first]}"
+        elif failure is not None:
+            verdict = failure
+        return {"verdict": verdict, "failure": failure, "steps": steps, **series}
+
+
+def draw(runs: dict[str, dict[str, Any]], path: Path) -> None:
+    """Plot every run's three series over the steps (see `Command`)."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(len(PANELS), 1, figsize=(9, 9), sharex=True, constrained_layout=True)
+    for axis, (name, unit) in zip(axes, PANELS.items(), strict=True):
+        for (label, run), style in zip(runs.items(), ("-", "--", "-", "--"), strict=False):
+            values = [math.nan if v is None else v for v in run[name]]
+            axis.plot(run["steps"], values, style, label=f"{label}: {run['verdict'][:60]}", linewidth=1)
+        axis.set_ylabel(f"{name}\n({unit})")
+        if name != "alive share":
+            axis.set_yscale("log")
+    axes[-1].set_xlabel("step")
+    axes[0].legend(fontsize=8)
+    figure.savefig(path, dpi=130)
+    pyplot.close(figure)
+
+
+if __name__ == "__main__":
+    tyro.cli(Command).run()

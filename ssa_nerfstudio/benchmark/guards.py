@@ -1,0 +1,84 @@
+"""What the guards cost: `python -m ssa_nerfstudio.benchmark.guards --data DIR`
+
+Two trainings of one process, with and without, take turns at blocks of steps, so that a machine that drifts drifts for
+both; the device is waited for between blocks only. Prints the ratio of the times with its 95 % interval.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+import tyro
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+from ssa_nerfstudio.benchmark.run import configure, versions
+from ssa_nerfstudio.plugin.trainer import SSATrainer
+
+
+@dataclass
+class Command:
+    """Measure the guards' cost."""
+
+    data: Path
+    """A nerfstudio dataset."""
+    method: str = "ssa-splatfacto"
+    """One of this plugin's methods."""
+    overlay: str = "on"
+    """on or off."""
+    blocks: int = 40
+    """Blocks of steps of each training; the first two warm up."""
+    block: int = 50
+    """Steps of a block."""
+    scale_factor: float = 1.0
+    """Photos are resized by this."""
+
+    def run(self) -> None:
+        """Train in turns and print one line."""
+        with TemporaryDirectory() as folder:
+            trainers = [self._trainer(Path(folder) / str(guards), guards) for guards in (False, True)]
+            times = np.array([[self._time(trainers[k], b) for k in (0, 1)] for b in range(self.blocks)])[2:]
+        ratios = times[:, 1] / times[:, 0]
+        draws = np.random.default_rng(0).choice(ratios, (10_000, len(ratios)))
+        low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
+        without = 1e3 * np.median(times[:, 0]) / self.block
+        print(
+            f"{self.method}, overlay {self.overlay}, {versions()['device']}: {without:.3f} ms a step without guards; "
+            f"with them {100 * (np.median(ratios) - 1):+.2f} % (95 %: {100 * (low - 1):+.2f} to {100 * (high - 1):+.2f} %)"
+        )
+
+    def _trainer(self, output: Path, guards: bool) -> SSATrainer:
+        model = {"overlay": self.overlay, "guards": guards, "num_downscales": 0}
+        config = configure(self.method, self.data, output, self.blocks * self.block, model, self.scale_factor)
+        config.scale_schedules = False
+        torch.manual_seed(0)
+        config.set_timestamp()
+        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.pipeline.train()
+        return trainer
+
+    def _time(self, trainer: SSATrainer, block: int) -> float:
+        _wait()
+        start = time.perf_counter()
+        for step in range(block * self.block, (block + 1) * self.block):
+            for callback in trainer.callbacks:
+                callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+            trainer.train_iteration(step)
+            for callback in trainer.callbacks:
+                callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        _wait()
+        return time.perf_counter() - start
+
+
+def _wait() -> None:
+    if torch.cuda.is_available():
+        torch.cuda.synchronize()
+
+
+if __name__ == "__main__":
+    tyro.cli(Command).run()

@@ -1,0 +1,44 @@
+"""The scripts that measure divergence and the guards' cost run on any machine."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from ssa_nerfstudio.benchmark import divergence, guards
+
+
+def test_divergence_is_noted_for_each_of_four_runs_and_drawn(tiny_scene, tmp_path):
+    divergence.Command(data=tiny_scene, output=tmp_path, steps=20, cap_max=4200, every=5).run()
+    content = json.loads((tmp_path / "divergence.json").read_text())
+    assert len(content["runs"]) == 4
+    for run in content["runs"].values():
+        assert run["verdict"] == "it does not diverge"
+        assert run["steps"] == [0, 5, 10, 15]
+        assert all(0 < value <= 1 for value in run["alive share"])
+        assert all(value > 0 for value in run["gradient norm"])
+    assert (tmp_path / "divergence.png").stat().st_size > 10_000
+
+
+def test_a_parameter_that_breaks_is_named_with_its_step(tiny_scene, tmp_path, monkeypatch):
+    from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+
+    original = SSASplatfactoModel.step_cb
+
+    def break_one(model, optimizers, step):
+        if step == 7 and not model.config.guards:
+            model.quats.data[0] = float("nan")
+        original(model, optimizers, step)
+
+    monkeypatch.setattr(SSASplatfactoModel, "step_cb", break_one)
+    run = divergence.Command(data=tiny_scene, output=tmp_path, steps=12, cap_max=4200, every=1)._train("off", False)
+    assert run["verdict"].startswith("quats first not finite at step 7")
+
+
+@pytest.mark.parametrize("overlay", ["on", "off"])
+def test_the_cost_of_the_guards_is_printed_with_its_interval(tiny_scene, capsys, overlay):
+    guards.Command(data=tiny_scene, overlay=overlay, blocks=5, block=3).run()
+    line = capsys.readouterr().out.strip().splitlines()[-1]
+    assert "ms a step without guards; with them" in line
+    assert "95 %" in line
