@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,25 +11,33 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
-from ssa_nerfstudio.plugin.camera_groups import LENS_VALUES, match_camera, nearest_aspect
+from ssa_nerfstudio.plugin.camera_groups import LENS_VALUES, find_frame, match_camera, nearest_aspect
 
 Overlay = ScreenSpaceOverlay | GivenOverlay
 
 
 class Artifacts(nn.Module):
-    """Overlays by camera group. Empty until `put` is called or a checkpoint makes room for its own."""
+    """Overlays by camera group. Empty until `put` is called or a checkpoint makes room for its own.
+
+    A group in front of which nothing was found has none, and a checkpoint remembers that, too.
+    """
 
     camera_keys: Tensor
+    """[G, 6], the cameras that have an overlay."""
     lenses: Tensor
-    """[G, LENS_VALUES], the raw cameras of the groups; empty where a checkpoint was written before they were kept."""
+    """[G, LENS_VALUES], their raw cameras; empty where a checkpoint was written before they were kept."""
+    bare_keys: Tensor
+    """[B, 6], the cameras in front of which nothing was found."""
 
     def __init__(self) -> None:
         super().__init__()
         self.overlays = nn.ModuleList()
         self.register_buffer("camera_keys", torch.zeros(0, 6, dtype=torch.float64))
         self.register_buffer("lenses", torch.zeros(0, LENS_VALUES, dtype=torch.float64))
+        self.register_buffer("bare_keys", torch.zeros(0, 6, dtype=torch.float64))
         self._keys: list[list[float]] = []
-        self._group_of_view: list[int] = []
+        self._bare: list[list[float]] = []
+        self._group_of_view: list[int | None] = []
 
     def __len__(self) -> int:
         return len(self.overlays)
@@ -40,7 +49,7 @@ class Artifacts(nn.Module):
 
     def put(
         self,
-        overlays: list[ScreenSpaceOverlay] | list[GivenOverlay],
+        overlays: Sequence[ScreenSpaceOverlay | GivenOverlay | None],
         keys: Tensor,
         groups: list[int],
         lenses: Tensor,
@@ -48,35 +57,42 @@ class Artifacts(nn.Module):
         """Put artifacts in front of the scene.
 
         Args:
-            overlays: one a camera group.
+            overlays: one a camera group; None where there is nothing in front.
             keys: [G, 6], what the groups' cameras are (`camera_groups.group_cameras`).
             groups: each training view's group.
             lenses: [G, LENS_VALUES], the groups' raw cameras (`camera_groups.describe_lenses`).
         """
         device = self.camera_keys.device
-        self.overlays = nn.ModuleList(overlays).to(device)
-        self.camera_keys, self.lenses = keys.to(device), lenses.to(device)
-        self._keys, self._group_of_view = keys.tolist(), groups
+        covered = torch.tensor([overlay is not None for overlay in overlays], dtype=torch.bool)
+        self.overlays = nn.ModuleList([overlay for overlay in overlays if overlay is not None]).to(device)
+        self.camera_keys, self.lenses = keys[covered].to(device), lenses[covered].to(device)
+        self.bare_keys = keys[~covered].to(device)
+        self._remember_keys()
+        place = torch.where(covered, covered.cumsum(0) - 1, -1).tolist()
+        self._group_of_view = [place[group] if place[group] >= 0 else None for group in groups]
 
     def learned(self) -> list[ScreenSpaceOverlay]:
         """The overlays that have parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
 
-    def layers_of_view(self, view: int, reduction: int) -> tuple[Tensor, Tensor]:
-        """Transmittance and added light in front of a training view, at 1 / reduction of its size."""
-        return self[self._group_of_view[view]].layers(reduction)
+    def layers_of_view(self, view: int, reduction: int) -> tuple[Tensor, Tensor] | None:
+        """Transmittance and added light in front of a training view, at 1 / reduction of its size; None: nothing is."""
+        group = self._group_of_view[view]
+        return None if group is None else self[group].layers(reduction)
 
     def layers_of_camera(
         self, camera: Cameras, width: int, height: int, group: int | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Transmittance and added light in front of any camera.
+    ) -> tuple[Tensor, Tensor] | None:
+        """Transmittance and added light in front of any camera, or None where nothing is.
 
         A camera with the frame of a group shows that group's; a free viewpoint the one of its aspect, or the first;
         unless a group is named.
         """
         if group is None:
-            group = match_camera(camera, self._keys)
-        return fitted(self[nearest_aspect(camera, self._keys) if group is None else group], height, width)
+            group = match_camera(camera, self._keys + self._bare)
+        if group is None:
+            group = nearest_aspect(camera, self._keys)
+        return fitted(self[group], height, width) if group < len(self) else None
 
     @torch.no_grad()
     def covered(self, group: int) -> tuple[Tensor, Tensor]:
@@ -100,13 +116,13 @@ class Artifacts(nn.Module):
         count = len(state.get(f"{prefix}camera_keys", ()))
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
         given = f"{prefix}overlays.0.transmittance" in state
-        if len(self):
+        if len(self) or len(self.bare_keys):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
-            if frames != here or given != isinstance(self[0], GivenOverlay):
+            if frames != here or (frames and given != isinstance(self[0], GivenOverlay)):
                 raise refuse(
                     f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale) "
-                    f"{frames or 'absent'}, this run's are {here}; resume with the photos, camera-res-scale-factor and "
-                    "overlay options it was trained with"
+                    f"{frames or 'absent'}, this run's are {here or 'absent'}; resume with the photos, "
+                    "camera-res-scale-factor and overlay options it was trained with"
                 )
             return
         if frames and not wanted:
@@ -116,12 +132,45 @@ class Artifacts(nn.Module):
             GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3)) if given else ScreenSpaceOverlay(h, w, resolution)
             for h, w, resolution in frames
         ).to(device)
-        self.camera_keys = torch.zeros(count, 6, dtype=torch.float64, device=device)
-        self.lenses = torch.zeros(
-            len(state.get(f"{prefix}lenses", ())), LENS_VALUES, dtype=torch.float64, device=device
-        )
+        for name in ("camera_keys", "lenses", "bare_keys"):
+            setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))
+
+    def take_over(self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str) -> None:
+        """Make room for the overlays of a checkpoint that is resumed, in front of the views that it had them in.
+
+        Args:
+            state, prefix: as for `make_room`.
+            keys, groups: of this run's training cameras, as for `put`.
+            setting: this run's overlay: auto, on or given.
+
+        Raises:
+            BadInput: the checkpoint knows no camera like one of this run's, or was trained with another setting.
+        """
+        self.make_room(state, prefix, wanted=True)
+        here = "given" if len(self) and isinstance(self[0], GivenOverlay) else "on" if len(self) else "off"
+        if setting not in ("auto", here):
+            raise refuse(
+                f"the checkpoint was trained with overlay {here}, this run has {setting}; resume with "
+                f"--pipeline.model.overlay {'auto' if here == 'off' else here}"
+            )
+        known = torch.cat([state.get(f"{prefix}{name}", torch.zeros(0, 6)) for name in ("camera_keys", "bare_keys")])
+        places: list[int | None] = []
+        for key in keys:
+            place = find_frame(key, known) if len(known) else len(self)
+            if place is None:
+                there = sorted({(int(width), int(height)) for width, height in known[:, :2].tolist()})
+                raise refuse(
+                    f"the checkpoint was trained on frames (width, height) of {there}, this run has "
+                    f"{tuple(key[:2].int().tolist())}; resume with the photos and camera-res-scale-factor of then"
+                )
+            places.append(place if place < len(self) else None)
+        self._group_of_view = [places[group] for group in groups]
+
+    def _remember_keys(self) -> None:
+        self._keys, self._bare = self.camera_keys.tolist(), self.bare_keys.tolist()
 
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
-        state_dict.setdefault(f"{prefix}lenses", self.lenses)  # checkpoints of the first version have none
+        for name in ("lenses", "bare_keys"):  # checkpoints of the first version have none
+            state_dict.setdefault(prefix + name, getattr(self, name))
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
-        self._keys = self.camera_keys.tolist()
+        self._remember_keys()

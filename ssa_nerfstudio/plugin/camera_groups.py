@@ -35,6 +35,14 @@ def match_camera(camera: Cameras, keys: list[list[float]]) -> int | None:
     return candidates[0] if candidates else None
 
 
+def find_frame(key: Tensor, keys: Tensor) -> int | None:
+    """The row of keys [G, 6] that is a camera [6]'s: same size and nearest intrinsics, None where no size is."""
+    same_size = (keys[:, :2] == key[:2]).all(dim=1)
+    if not same_size.any():
+        return None
+    return int(torch.where(same_size, (keys - key).abs().amax(dim=1), torch.inf).argmin())
+
+
 def nearest_aspect(camera: Cameras, keys: list[list[float]]) -> int:
     """The group whose aspect is that of a free viewpoint (within 1 %), or the first."""
     width, height = describe(camera)[0, :2].tolist()

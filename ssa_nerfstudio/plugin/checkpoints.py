@@ -8,6 +8,10 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any
+
+import torch
 
 PARTIAL = "checkpoint.partial"
 """Folder in a run's own folder where a checkpoint is written. A run that is killed while it writes leaves it behind;
@@ -53,3 +57,11 @@ def written_whole(folder: Path) -> Iterator[Path]:
             path.replace(folder / path.name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def saved_pipeline(checkpoint: Path) -> dict[str, Any] | None:
+    """The pipeline's state in a checkpoint, mapped and not read; None where the file is none."""
+    try:
+        return torch.load(checkpoint, map_location="cpu", mmap=True, weights_only=True)["pipeline"]
+    except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError):
+        return None

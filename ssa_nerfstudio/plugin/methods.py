@@ -78,6 +78,7 @@ ssa_splatfacto_paper = MethodSpecification(
     config=_trainer(
         "ssa-splatfacto-paper",
         SSASplatfactoModelConfig(
+            overlay="on",
             sparsity="l1",
             sparsity_weight=0.05,
             background_color="black",

@@ -33,8 +33,9 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """Configuration of `SSASplatfactoModel`: splatfacto's, and the artifact's."""
 
     _target: type = field(default_factory=lambda: SSASplatfactoModel)
-    overlay: Literal["on", "off", "given"] = "on"
-    """on: learn the artifact; off: plain splatfacto; given: take the true artifact from overlay_given."""
+    overlay: Literal["auto", "on", "off", "given"] = "auto"
+    """auto: learn an artifact in front of the cameras that detection finds one in front of, and pay for nothing else;
+    on: learn one in front of every camera; off: plain splatfacto; given: take the true one from overlay_given."""
     overlay_given: Path | None = None
     """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
     (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
@@ -209,9 +210,12 @@ class SSASplatfactoModel(SplatfactoModel):
         if in_viewer():
             return self._controls.outputs(drawn, camera, width, height)
         if self.training:
-            transmittance, addition = self.artifacts.layers_of_view(metadata(camera)["cam_idx"], reduction)
+            layers = self.artifacts.layers_of_view(metadata(camera)["cam_idx"], reduction)
         else:
-            transmittance, addition = self.artifacts.layers_of_camera(camera, width, height)
+            layers = self.artifacts.layers_of_camera(camera, width, height)
+        if layers is None:
+            return drawn
+        transmittance, addition = layers
         if self.training and self.config.ignore_background and self.artifacts.learned():
             drawn["composite"] = composite_over_splats(
                 drawn["rgb"], drawn["accumulation"], drawn["background"], transmittance, addition

@@ -6,18 +6,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import torch
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
-from rich.progress import track
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from ssa_nerfstudio.errors import refuse
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.statistics import accumulate
 from ssa_nerfstudio.plugin.camera_groups import describe_lenses, group_cameras
+from ssa_nerfstudio.plugin.checkpoints import saved_pipeline
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
+from ssa_nerfstudio.plugin.first_look import given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.inputs import check_device, check_settings, check_transforms, check_views
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 
@@ -31,6 +28,9 @@ class SSAPipelineConfig(VanillaPipelineConfig):
     """The photos and cameras."""
     model: SSASplatfactoModelConfig = field(default_factory=SSASplatfactoModelConfig)
     """The scene and the artifact."""
+    artifacts_of: Path | None = None
+    """A checkpoint whose overlays, or lack of them, are taken over instead of looking at the photos. The trainer sets
+    it when it resumes."""
 
 
 class SSAPipeline(VanillaPipeline):
@@ -62,8 +62,7 @@ class SSAPipeline(VanillaPipeline):
             positions = cameras.camera_to_worlds[:, :3, 3]
             self.model.set_scene_extent(_extent(positions))
             self.model.start_outside_cameras(positions)
-            if config.model.overlay != "off":
-                self._set_overlays()
+            self._set_overlays()
 
     def get_train_loss_dict(self, step: int):
         """Upstream's, with the whole loss kept for the guard that reads it before the optimisers step."""
@@ -72,23 +71,25 @@ class SSAPipeline(VanillaPipeline):
         return outputs, losses, metrics
 
     def _set_overlays(self) -> None:
+        setting = self.config.model.overlay
+        resumed = saved_pipeline(self.config.artifacts_of) if self.config.artifacts_of else None
+        if setting == "off" or (resumed is None and self.config.artifacts_of):
+            return  # what is wrong with the checkpoint, loading it will tell
         lenses = describe_lenses(self.datamanager.train_dataset.cameras)
         # Undistorts and crops the photos and rewrites the cameras: the overlay lives in what comes out.
         photos = self.datamanager.cached_train
         keys, groups = group_cameras(self.datamanager.train_dataset.cameras)
         sizes = [(int(key[1]), int(key[0])) for key in keys]
-        if self.config.model.overlay == "given":
-            overlays = _load_given(self.config.model.overlay_given, sizes)
+        artifacts = self.model.artifacts
+        if resumed is not None:
+            artifacts.take_over(resumed, "_model.artifacts.", keys, groups, setting)
+            return
+        if setting == "given":
+            overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
-            overlays = [ScreenSpaceOverlay(*size, self.config.model.overlay_downscale) for size in sizes]
-            if self.config.model.overlay_start == "statistics":
-                for g, overlay in enumerate(overlays):
-                    members = [photo for photo, group in zip(photos, groups, strict=True) if group == g]
-                    views = ((photo["image"], photo.get("mask")) for photo in members)
-                    label = f"Statistics of camera {g + 1} of {len(overlays)}"
-                    overlay.start_from(accumulate(track(views, label, total=len(members), transient=True)))
+            overlays = learned_overlays(self.config.model, photos, groups, sizes)
         first = [groups.index(g) for g in range(len(keys))]
-        self.model.artifacts.put(overlays, keys, groups, lenses[first])
+        artifacts.put(overlays, keys, groups, lenses[first])
 
 
 def _source(config: SSAPipelineConfig) -> Path:
@@ -99,24 +100,3 @@ def _source(config: SSAPipelineConfig) -> Path:
 def _extent(positions: torch.Tensor) -> float:
     """Radius of the cameras around their centre, times 1.1 (3DGS's `nerf_normalization`; at least 1e-6)."""
     return max(1e-6, 1.1 * float((positions - positions.mean(dim=0)).norm(dim=1).max()))
-
-
-def _load_given(path: Path | None, sizes: list[tuple[int, int]]) -> list[GivenOverlay]:
-    """The true layers of every camera group from an .npz file."""
-    if path is None:
-        raise refuse(
-            "overlay 'given' needs the layers; add --pipeline.model.overlay-given FILE.npz with arrays T and B"
-        )
-    try:
-        arrays = np.load(path)
-        names = [("T", "B")] if len(sizes) == 1 and "T" in arrays else [(f"T{g}", f"B{g}") for g in range(len(sizes))]
-        overlays = [GivenOverlay(torch.from_numpy(arrays[t]), torch.from_numpy(arrays[b])) for t, b in names]
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise refuse(f"{path} holds no usable layers ({error}); give an .npz with T and B [H, W, 3]") from error
-    for overlay, size in zip(overlays, sizes, strict=True):
-        if (overlay.height, overlay.width) != size:
-            raise refuse(
-                f"{path} has layers of {overlay.height} x {overlay.width} pixels, the undistorted photos have "
-                f"{size[0]} x {size[1]}; give the layers in the undistorted frame at the training resolution"
-            )
-    return overlays

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from pickle import UnpicklingError
 from typing import Literal
 
@@ -14,7 +15,7 @@ from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.errors import give_up, refuse, warn
-from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, step_of, written_whole
+from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
 from ssa_nerfstudio.plugin.guards import READ_EVERY, GuardedOptimizers, StepGuard, first_not_finite
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
@@ -57,6 +58,23 @@ class SSATrainer(Trainer):
             config = scaled(config)
         super().__init__(config, local_rank, world_size)
 
+    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+        """Set up; a resumed run takes over the overlays of its checkpoint, before the optimisers are built."""
+        self.config.pipeline.artifacts_of = self._resumed_checkpoint()
+        super().setup(test_mode)
+
+    def _resumed_checkpoint(self) -> Path | None:
+        """The checkpoint to resume from: without --load-step the newest that is whole."""
+        folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
+        check_checkpoint(folder, step, file)
+        if folder is None:
+            return file
+        if step is not None:
+            return folder / f"step-{step:09d}.ckpt"
+        candidates = newest_first(folder)
+        usable = (path for path in candidates if damage(path) is None and saved_pipeline(path) is not None)
+        return next(usable, candidates[0])
+
     def setup_optimizers(self) -> Optimizers:
         """Optimisers of the configuration; the means' learning rate in units of the scene where the model asks so."""
         self.pipeline.model.metrics_every = max(1, self.config.logging.steps_per_log)
@@ -88,7 +106,6 @@ class SSATrainer(Trainer):
     def _load_checkpoint(self) -> None:
         """Resume as upstream does; without --load-step from the newest checkpoint that is whole, saying which."""
         folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
-        check_checkpoint(folder, step, file)
         if folder is None and file is None:
             super()._load_checkpoint()
             return

@@ -20,7 +20,7 @@ from ssa_nerfstudio.plugin.schedules import scaled
 
 
 def run(data: Path, output: Path, steps: int, method: str = "ssa-splatfacto", **model):
-    return train_and_evaluate(configure(method, data, output, steps, {"num_downscales": 0, **model}))
+    return train_and_evaluate(configure(method, data, output, steps, {"num_downscales": 0, "overlay": "on", **model}))
 
 
 def dashboard_layers(path: Path) -> Path:

@@ -10,7 +10,7 @@ from small_datasets import pixels, write_dataset
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.plugin.camera_groups import group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
-from ssa_nerfstudio.plugin.pipeline import _load_given
+from ssa_nerfstudio.plugin.first_look import given_overlays
 from ssa_nerfstudio.simulation.dataset import Dataset
 
 
@@ -29,7 +29,7 @@ def test_given_layers_explain_the_photos_that_the_model_sees(model, tmp_path):
         assert len(manager.eval_dataset) == 2
         assert len(groups) == 8
     sizes = [(int(key[1]), int(key[0])) for key in keys]
-    (overlay,) = _load_given(corrupted / "layers/undistorted.npz", sizes)
+    (overlay,) = given_overlays(corrupted / "layers/undistorted.npz", sizes)
     transmittance, addition = (layer.numpy() for layer in overlay.layers())
     for before, after in zip(views[clean], views[corrupted], strict=True):
         formed = (transmittance * (before / 255) + addition).clip(0, 1) * 255

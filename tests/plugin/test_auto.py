@@ -1,0 +1,156 @@
+"""`overlay: auto`: learned where something is in front, nothing paid where nothing is, decided once."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from conftest import edit_transforms
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
+
+from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
+from ssa_nerfstudio.demo.scene import DemoScene
+from ssa_nerfstudio.plugin import first_look
+from ssa_nerfstudio.plugin.trainer import SSATrainer
+
+
+@pytest.fixture(scope="module")
+def clean_scene(tmp_path_factory) -> Path:
+    """The tiny scene without its dashboard."""
+    folder = tmp_path_factory.mktemp("clean") / "scene"
+    DemoScene(views=12, test_views=3, width=64, height=48).write(folder, None)
+    return folder
+
+
+def losses(data: Path, output: Path, overlay: str, steps: int = 50) -> tuple[list[dict[str, float]], SSATrainer]:
+    """Every loss of every step."""
+    torch.manual_seed(0)
+    np.random.seed(0)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
+    config = configure("ssa-splatfacto", data, output, steps, {"overlay": overlay})
+    config.set_timestamp()
+    trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    seen = []
+    for step in range(steps):
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        _, parts, _ = trainer.train_iteration(step)
+        for callback in trainer.callbacks:
+            callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        seen.append({name: float(value) for name, value in parts.items()})
+    return seen, trainer
+
+
+def test_a_clean_scene_pays_for_nothing(clean_scene, tmp_path):
+    """No parameter, optimiser or output of an overlay, and 50 steps whose losses are overlay-off's bit for bit."""
+    off, _ = losses(clean_scene, tmp_path, "off")
+    auto, trainer = losses(clean_scene, tmp_path, "auto")
+    assert auto == off
+    assert len(off) == 50
+    assert not [name for name, _ in trainer.pipeline.model.named_parameters() if "overlay" in name]
+    assert "overlay" not in trainer.optimizers.optimizers
+    camera, _ = trainer.pipeline.datamanager.next_train(50)
+    assert not {"composite", "overlay_rgb", "overlay_alpha"} & trainer.pipeline.model(camera).keys()
+    trainer.pipeline.eval()
+    camera, _ = trainer.pipeline.datamanager.fixed_indices_eval_dataloader[0]
+    drawn = trainer.pipeline.model.get_outputs_for_camera(camera)
+    assert not {"composite", "overlay_rgb", "overlay_alpha"} & drawn.keys()
+
+
+def test_a_dashboard_is_learned(tiny_scene, tmp_path):
+    on, _ = losses(tiny_scene, tmp_path, "on", steps=5)
+    auto, trainer = losses(tiny_scene, tmp_path, "auto", steps=5)
+    assert auto == on
+    assert "overlay" in trainer.optimizers.optimizers
+
+
+@pytest.mark.parametrize("scene", ["clean_scene", "tiny_scene"])
+def test_resuming_and_reloading_never_look_again(scene, tmp_path, request, monkeypatch):
+    data = request.getfixturevalue(scene)
+    config = configure("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
+    config.max_num_iterations = 4
+    _, first, path = train_and_evaluate(config)
+
+    def never(*_):
+        raise AssertionError("looked again")
+
+    monkeypatch.setattr(first_look, "detect", never)
+    monkeypatch.setattr(first_look, "accumulate", never)
+    resumed = configure("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
+    resumed.load_dir = path.parent / "nerfstudio_models"
+    _, second, again = train_and_evaluate(resumed)
+    assert len(first.model.artifacts) == len(second.model.artifacts) == (scene == "tiny_scene")
+    assert ("overlay" in second.get_param_groups()) == (scene == "tiny_scene")
+    _, reloaded, _, _ = eval_setup(again, test_mode="inference")
+    assert len(reloaded.model.artifacts) == len(second.model.artifacts)
+    saved = torch.load(next((again.parent / "nerfstudio_models").glob("*.ckpt")))
+    if scene == "tiny_scene":
+        assert saved["optimizers"]["overlay"]["state"][0]["step"] == 8
+    else:
+        assert len(saved["pipeline"]["_model.artifacts.bare_keys"]) == 1
+
+
+def test_each_camera_of_a_rig_has_its_own_verdict(clean_scene, tmp_path):
+    """Two cameras, a board in front of the second only: the first has no overlay, in training and in evaluation."""
+    scene = Path(shutil.copytree(clean_scene, tmp_path / "scene"))
+    transforms = json.loads((scene / "transforms.json").read_text())
+    shared = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    training = set(transforms["train_filenames"])
+    frames = []
+    for number, frame in enumerate(transforms["frames"]):
+        for camera in range(2 if frame["file_path"] in training else 1):
+            name = f"images/{camera}_{Path(frame['file_path']).name}"
+            photo = np.array(Image.open(scene / frame["file_path"]))
+            if camera == 1:
+                photo[36:] = (40, 30, 20)
+            Image.fromarray(photo).save(scene / name)
+            values = {key: transforms[key] for key in shared}
+            frames.append({**frame, **values, "cx": values["cx"] + 2 * camera, "file_path": name, "number": number})
+    names = {"train_filenames": [f["file_path"] for f in frames if "train" in f["file_path"]]}
+    names["test_filenames"] = names["val_filenames"] = [f["file_path"] for f in frames if "test" in f["file_path"]]
+    path = scene / "transforms.json"
+    path.write_text(json.dumps({k: v for k, v in transforms.items() if k not in shared}))
+    edit_transforms(scene, frames=frames, **names)
+    _, pipeline, config = train_and_evaluate(configure("ssa-splatfacto", scene, tmp_path, 6, {"num_downscales": 0}))
+    artifacts = pipeline.model.artifacts
+    assert (len(artifacts), artifacts.bare_keys.shape[0]) == (1, 1)
+    assert {artifacts._group_of_view[i] is None for i in range(24)} == {True, False}
+    pipeline.eval()
+    camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]  # the first camera's
+    assert "composite" not in pipeline.model.get_outputs_for_camera(camera)
+    resumed = configure("ssa-splatfacto", scene, tmp_path, 9, {"num_downscales": 0})
+    resumed.load_dir = config.parent / "nerfstudio_models"
+    _, second, _ = train_and_evaluate(resumed)
+    assert second.model.artifacts._group_of_view == artifacts._group_of_view
+
+
+def test_one_line_says_what_was_decided(clean_scene, tiny_scene, tmp_path, capsys):
+    for data, expected in ((clean_scene, "training without an overlay"), (tiny_scene, "opaque")):
+        config = configure("ssa-splatfacto", data, tmp_path, 1, {"num_downscales": 0})
+        config.set_timestamp()
+        config.setup(local_rank=0, world_size=1).setup()
+        told = " ".join(capsys.readouterr().out.split())
+        assert expected in told
+        assert "--pipeline.model.overlay" in told
+
+
+def test_auto_is_the_default_except_for_the_papers_protocol():
+    settings = {name: config.pipeline.model.overlay for name, config in METHODS.items()}
+    assert settings == {"ssa-splatfacto": "auto", "ssa-splatfacto-mcmc": "auto", "ssa-splatfacto-paper": "on"}
+
+
+def test_resuming_without_an_overlay_cannot_force_one(clean_scene, tmp_path, capsys):
+    config = configure("ssa-splatfacto", clean_scene, tmp_path, 2, {"num_downscales": 0})
+    _, _, path = train_and_evaluate(config)
+    other = configure("ssa-splatfacto", clean_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "on"})
+    other.load_dir = path.parent / "nerfstudio_models"
+    with pytest.raises(SystemExit) as refused:
+        train_and_evaluate(other)
+    assert refused.value.code == 2
+    assert "--pipeline.model.overlay auto" in capsys.readouterr().err
