@@ -106,7 +106,10 @@ def _photos(path: Path, name: str, least: int, photos: list[Path], videos: list[
     for photo in photos:
         with open_photo(photo) as image:
             mode, size = image.mode, image.size
-            orientation = image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT)
+            try:
+                orientation = image.getexif().get(ExifTags.Base.Orientation, _UPRIGHT)
+            except (OSError, SyntaxError, ValueError) as error:  # a PNG is decoded for it
+                raise refuse(f"{photo} is broken ({error}); copy it again from its source or take it out") from error
         if mode not in _MODES:
             raise refuse(f"{photo} is of mode {mode}; convert it to 8-bit RGB")
         first = first or (size, orientation)

@@ -9,6 +9,7 @@ import warnings
 COMMANDS = {
     "bench": "Train and score a matrix of scenes, artifacts, methods and seeds; resumable.",
     "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
+    "detect": "Say whether photos have a static artifact in front of the scene, and where.",
     "process": "Make a nerfstudio dataset from photos or videos, with poses that a static artifact does not mislead.",
     "report": "Tables and pictures from the results of ssa bench.",
     "simulate": "Put an artifact in front of the training photos of a nerfstudio dataset.",

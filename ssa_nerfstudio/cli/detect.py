@@ -1,0 +1,72 @@
+"""`ssa detect`: the arguments and what they are handed to."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from ssa_nerfstudio.errors import refuse
+
+
+@dataclass
+class Command:
+    """Say whether photos have a static artifact in front of the scene, and where; poses are not needed."""
+
+    data: Path
+    """A nerfstudio dataset (its training photos), a folder of photos or videos, or one video."""
+    output: Path | None = None
+    """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Nothing is written
+    where it is not given."""
+    json: Path | None = None
+    """File to write verdict, coverage, p_value, views and more of each camera to."""
+    draws: int = 200
+    """Captures of randomly shifted views to compare with, at least 200."""
+    frames: int = 200
+    """Frames to take from videos."""
+    threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Photos decoded at once."""
+
+    def run(self) -> None:
+        """Detect, say what was found, and write what was asked for.
+
+        Raises:
+            BadInput: the arguments or photos cannot be worked with.
+        """
+        from contextlib import nullcontext
+
+        from rich.console import Console
+
+        from ssa_nerfstudio.capture.detect import as_json, cameras_of, detect_camera, write_detections
+        from ssa_nerfstudio.overlay.detection import LEAST_BLOCKS
+        from ssa_nerfstudio.simulation.staging import staged_folder
+
+        for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
+            if (value := getattr(self, name)) < lowest:
+                raise refuse(f"--{name} must be at least {lowest}, got {value}")
+        if self.json is not None and not self.json.parent.is_dir():
+            raise refuse(f"--json {self.json}: there is no folder {self.json.parent}; make it first")
+        console = Console(highlight=False, soft_wrap=True)
+        with staged_folder(self.output) if self.output else nullcontext() as folder:
+            cameras = cameras_of(self.data, self.frames)
+            found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
+            if folder is not None:
+                write_detections(folder, found)
+        if self.json is not None:
+            try:
+                self.json.write_text(as_json(found), encoding="utf-8")
+            except OSError as error:
+                raise refuse(f"{self.json} cannot be written ({error}); name another file") from error
+        for name, detection in found.items():
+            low, high = detection.p_interval
+            camera = f"{name}: " if len(found) > 1 else ""
+            if detection.views < LEAST_BLOCKS:
+                console.print(f"{camera}{detection.views} views are too few to tell; {LEAST_BLOCKS} are needed")
+                continue
+            covered = f", {detection.coverage:.1%} of the frame" if detection.verdict != "none" else ""
+            console.print(
+                f"{camera}{detection.verdict}{covered} ({detection.views} views, p = {detection.p_value:.3g}, "
+                f"false alarms [{low:.3f}, {high:.3f}])"
+            )
+        if self.output is not None:
+            console.print(f"{self.output}: evidence.png, and masks whose black is the artifact")

@@ -1,0 +1,163 @@
+"""`ssa detect` on files: the verdict of each camera, the masks, and bad input in one line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import edit_transforms
+from PIL import Image
+
+from ssa_nerfstudio.cli import main
+
+
+def photos(folder: Path, count: int = 14, artifact: bool = True, size: tuple[int, int] = (64, 96)) -> Path:
+    """A wall of noise from changing places, a bright bar in front."""
+    rng = np.random.default_rng(0)
+    wall = cv2.resize(rng.integers(0, 256, (80, 80, 3), dtype=np.uint8), (400, 400), interpolation=cv2.INTER_CUBIC)
+    folder.mkdir(parents=True)
+    height, width = size
+    for number in range(count):
+        y, x = rng.integers(0, 400 - max(size), 2)
+        photo = wall[y : y + height, x : x + width].copy()
+        if artifact:
+            photo[10:20, 20:70] = (250, 250, 200)
+        Image.fromarray(photo).save(folder / f"photo_{number}.png")
+    return folder
+
+
+def verdicts(path: Path) -> list[dict]:
+    return json.loads(path.read_text())["groups"]
+
+
+def test_a_folder_of_photos_is_enough(tmp_path, capsys):
+    data, output, report = photos(tmp_path / "photos"), tmp_path / "found", tmp_path / "found.json"
+    main(["detect", "--data", str(data), "--output", str(output), "--json", str(report)])
+    (group,) = verdicts(report)
+    assert group["verdict"] == "opaque"
+    assert group["views"] == 14
+    assert group["p_value"] < 0.01
+    masks = [np.asarray(Image.open(output / f"mask_{name}.png")) for name in ("nerfstudio", "colmap")]
+    assert (masks[0] == masks[1]).all()
+    assert masks[0].shape == (64, 96)
+    assert (masks[0][12:18, 24:66] == 0).all()  # black is what both ignore
+    assert (masks[0][30:] == 255).mean() > 0.98
+    assert group["coverage"] == pytest.approx((masks[0] == 0).mean())
+    assert Image.open(output / "evidence.png").mode == "RGB"
+    assert "opaque" in capsys.readouterr().out
+
+
+def test_clean_photos_give_none_and_a_white_mask(tmp_path):
+    data, output, report = photos(tmp_path / "photos", artifact=False), tmp_path / "found", tmp_path / "found.json"
+    main(["detect", "--data", str(data), "--output", str(output), "--json", str(report)])
+    (group,) = verdicts(report)
+    assert (group["verdict"], group["coverage"]) == ("none", 0.0)
+    assert (np.asarray(Image.open(output / "mask_colmap.png")) == 255).all()
+
+
+def test_a_dataset_is_looked_at_camera_by_camera_and_only_where_it_trains(tiny_scene, tmp_path):
+    """Two sizes of frame, and clean test views that would thin the evidence out."""
+    scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+    transforms = json.loads((scene / "transforms.json").read_text())
+    frames = []
+    for frame in transforms["frames"]:
+        frames += [frame, {**frame, "file_path": frame["file_path"].replace("images/", "images/small_")}]
+        photo = Image.open(scene / frame["file_path"])
+        half = photo.resize((photo.width // 2, photo.height // 2))
+        half.save(scene / frames[-1]["file_path"])
+        for f, n in ((frames[-2], 1), (frames[-1], 2)):
+            f.update({key: transforms[key] / n for key in ("fl_x", "fl_y", "cx", "cy")})
+            f.update({key: transforms[key] // n for key in ("w", "h")})
+    names = {
+        key: [f["file_path"] for f in frames if kind in f["file_path"]]
+        for key, kind in (("train_filenames", "train"), ("test_filenames", "test"), ("val_filenames", "test"))
+    }
+    kept = {k: v for k, v in transforms.items() if k not in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    (scene / "transforms.json").write_text(json.dumps(kept))
+    edit_transforms(scene, frames=frames, **names)
+    report = tmp_path / "found.json"
+    main(["detect", "--data", str(scene), "--output", str(tmp_path / "found"), "--json", str(report)])
+    first, second = verdicts(report)
+    assert first["verdict"] == second["verdict"] == "opaque"
+    assert {(g["width"], g["height"]) for g in (first, second)} == {(64, 48), (32, 24)}
+    assert first["views"] == second["views"] == 12
+    assert sorted(p.name for p in (tmp_path / "found").iterdir()) == ["camera-1", "camera-2"]
+
+
+def test_a_video_is_taken_too(tmp_path):
+    data = photos(tmp_path / "photos", count=20)
+    video = tmp_path / "walk.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
+    for number in range(20):
+        writer.write(cv2.imread(str(data / f"photo_{number}.png")))
+    writer.release()
+    report = tmp_path / "found.json"
+    main(["detect", "--data", str(video), "--json", str(report)])
+    assert verdicts(report)[0]["verdict"] == "opaque"
+
+
+def broken(folder: Path) -> Path:
+    (folder / "photo_3.png").write_text("no photo")
+    return folder
+
+
+def truncated(folder: Path) -> Path:
+    path = folder / "photo_3.png"
+    path.write_bytes(path.read_bytes()[:500])
+    return folder
+
+
+def on_its_side(folder: Path) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.open(folder / "photo_3.png").save(folder / "photo_3.jpg", exif=exif)
+    (folder / "photo_3.png").unlink()
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("spoil", "complaint"),
+    [
+        (lambda folder: folder / "nowhere", "does not exist"),
+        (lambda folder: photos(folder / "one", count=1), "2 are needed"),
+        (lambda folder: (folder / "empty").mkdir() or folder / "empty", "holds no photo"),
+        (broken, "photo_3.png"),
+        (truncated, "photo_3.png"),
+        (on_its_side, "EXIF orientation"),
+    ],
+    ids=["missing", "one photo", "empty", "text", "truncated", "mixed orientations"],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, complaint):
+    data = spoil(photos(tmp_path / "photos"))
+    with pytest.raises(SystemExit) as refused:
+        main(["detect", "--data", str(data), "--output", str(tmp_path / "found")])
+    assert refused.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert complaint in line
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize("options", [["--draws", "10"], ["--json", "nowhere/found.json"], ["--threads", "0"]])
+def test_arguments_that_make_no_sense_are_refused(tmp_path, capsys, options):
+    with pytest.raises(SystemExit) as refused:
+        main(["detect", "--data", str(tmp_path), *options])
+    assert refused.value.code == 2
+    assert options[0] in capsys.readouterr().err
+
+
+def test_a_full_disk_leaves_nothing(tmp_path):
+    """A limit on the size of files stands in for it: writing fails as on a full disk, in a real process."""
+    data = photos(tmp_path / "photos")
+    limited = "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64)); from ssa_nerfstudio.cli import main; "
+    limited += f"main(['detect', '--data', {str(data)!r}, '--output', {str(tmp_path / 'found')!r}])"
+    done = subprocess.run([sys.executable, "-c", limited], capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert "cannot be written" in done.stderr.splitlines()[-1]
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
