@@ -97,10 +97,16 @@ class ScreenSpaceOverlay(nn.Module):
         self.height, self.width, self.resolution = height, width, resolution
 
     @torch.no_grad()
-    def start_from(self, statistics: ImageStatistics) -> None:
+    def start_from(self, statistics: ImageStatistics, everywhere: bool = False) -> None:
         """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05).
 
-        The weight of the sparsity is made of two things: sigma, and where detection sees static edges.
+        A sky is as constant as a dashboard, but static edges enclose the dashboard alone. Outside of the area where
+        detection would see an artifact the matte starts at 0.1 at most (that of the constant start), and sparsity
+        weighs in full.
+
+        Args:
+            statistics: of the photos.
+            everywhere: as the paper has it: sigma decides alone.
 
         Raises:
             ValueError: where the statistics are of another frame.
@@ -111,7 +117,9 @@ class ScreenSpaceOverlay(nn.Module):
         # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the
         # pixel, is 1, and its mean colour would be lost.
         alpha = torch.exp(-deviation / STATISTICS_SCALE)
-        pair = torch.cat([alpha, alpha * mean, deviation, static_area(statistics).to(alpha)[..., None]], dim=-1)
+        area = torch.ones_like(alpha) if everywhere else static_area(statistics).to(alpha)[..., None]
+        alpha = torch.where(area > 0, alpha, alpha.clamp_max(CONSTANT_START[1]))
+        pair = torch.cat([alpha, alpha * mean, deviation, area], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
             padded = nn.functional.pad(

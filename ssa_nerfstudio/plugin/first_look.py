@@ -31,14 +31,14 @@ def learned_overlays(
     overlays: list[ScreenSpaceOverlay | None] = []
     for group, size in enumerate(sizes):
         overlay = ScreenSpaceOverlay(*size, config.overlay_downscale)
-        if config.overlay == "auto" or config.overlay_start == "statistics":
+        if config.overlay == "auto" or config.overlay_start != "constant":
             name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
             statistics = _look_at([photo for photo, at in zip(photos, groups, strict=True) if at == group], name)
             if config.overlay == "auto" and not _found(detect(statistics), name):
                 overlays.append(None)
                 continue
-            if config.overlay_start == "statistics":
-                overlay.start_from(statistics)
+            if config.overlay_start != "constant":
+                overlay.start_from(statistics, everywhere=config.overlay_start == "statistics")
         overlays.append(overlay)
     return overlays
 

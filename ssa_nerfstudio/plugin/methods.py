@@ -79,6 +79,7 @@ ssa_splatfacto_paper = MethodSpecification(
         "ssa-splatfacto-paper",
         SSASplatfactoModelConfig(
             overlay="on",
+            overlay_start="statistics",
             sparsity="l1",
             sparsity_weight=0.05,
             background_color="black",

@@ -39,8 +39,9 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     overlay_given: Path | None = None
     """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
     (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
-    overlay_start: Literal["statistics", "constant"] = "statistics"
-    """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); constant: W = 0.5, A = 0.1 (its ablation)."""
+    overlay_start: Literal["detected", "statistics", "constant"] = "detected"
+    """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); detected: that where static edges enclose it,
+    A = 0.1 at most elsewhere; constant: W = 0.5, A = 0.1 (the paper's ablation)."""
     overlay_downscale: Literal[1, 2, 4] = 1
     """The overlay has one pixel for a block of this many pixels a side: 1, 1/2 or 1/4 of the photos' resolution."""
     sparsity: Sparsity = "log"

@@ -58,11 +58,6 @@ class SSATrainer(Trainer):
             config = scaled(config)
         super().__init__(config, local_rank, world_size)
 
-    def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Set up; a resumed run takes over the overlays of its checkpoint, before the optimisers are built."""
-        self.config.pipeline.artifacts_of = self._resumed_checkpoint()
-        super().setup(test_mode)
-
     def _resumed_checkpoint(self) -> Path | None:
         """The checkpoint to resume from: without --load-step the newest that is whole."""
         folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
@@ -90,7 +85,11 @@ class SSATrainer(Trainer):
         return GuardedOptimizers(self.config.optimizers.copy(), groups, self.guard, lambda: self.pipeline.loss)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Set up as upstream does, and say at the end of the training what became of the artifact."""
+        """Set up as upstream does, and say at the end of the training what became of the artifact.
+
+        A resumed run takes over the overlays of its checkpoint: they have to be there before the optimisers are built.
+        """
+        self.config.pipeline.artifacts_of = self._resumed_checkpoint()
         super().setup(test_mode)
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._tell_artifact))
 

@@ -82,7 +82,10 @@ class ArtifactControls(nn.Module):
         @cache
         @torch.no_grad()
         def layers() -> tuple[Tensor, Tensor]:
-            transmittance, addition = self._artifacts().layers_of_camera(camera, width, height, group)
+            found = self._artifacts().layers_of_camera(camera, width, height, group)
+            if found is None:  # a camera of a rig with nothing in front
+                return clean.new_ones(height, width, 1), clean.new_zeros(height, width, 3)
+            transmittance, addition = found
             return 1.0 - strength * (1.0 - transmittance), strength * addition
 
         pictures: dict[str, Callable[[], Tensor]] = {

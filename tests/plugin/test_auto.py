@@ -17,6 +17,7 @@ from PIL import Image
 from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
 from ssa_nerfstudio.demo.scene import DemoScene
 from ssa_nerfstudio.plugin import first_look
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 
@@ -88,6 +89,7 @@ def test_resuming_and_reloading_never_look_again(scene, tmp_path, request, monke
     assert len(first.model.artifacts) == len(second.model.artifacts) == (scene == "tiny_scene")
     assert ("overlay" in second.get_param_groups()) == (scene == "tiny_scene")
     _, reloaded, _, _ = eval_setup(again, test_mode="inference")
+    assert isinstance(reloaded.model, SSASplatfactoModel)
     assert len(reloaded.model.artifacts) == len(second.model.artifacts)
     saved = torch.load(next((again.parent / "nerfstudio_models").glob("*.ckpt")))
     if scene == "tiny_scene":
