@@ -51,7 +51,7 @@ def test_a_new_overlay_has_the_constant_start_of_the_paper() -> None:
 def test_colour_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_over_0_05() -> None:
     photos, statistics = capture(9, 13)
     overlay = ScreenSpaceOverlay(9, 13)
-    overlay.start_from(statistics)
+    overlay.start_from(statistics, everywhere=True)
     values = photos / 255
     mean = np.clip(values.mean(axis=0), 1 / 510, 1 - 1 / 510)
     sigma = values.std(axis=0).max(axis=-1, keepdims=True)
@@ -63,11 +63,31 @@ def test_colour_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_o
     assert ((matte > 0.02) & (matte < 0.98)).any()
 
 
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_by_default_only_what_static_edges_enclose_starts_opaque(resolution: int) -> None:
+    """A plain board below, a plain sky above: the views agree on both, but the sky's edge moves."""
+    rng = np.random.default_rng(3)
+    photos = rng.integers(0, 256, (20, 48, 64, 3), dtype=np.uint8)
+    for photo in photos:
+        photo[: 12 + rng.integers(0, 6)] = (120, 160, 220)
+        photo[36:] = (40, 30, 20)
+    statistics = accumulate((torch.from_numpy(photo), None) for photo in photos)
+    overlay = ScreenSpaceOverlay(48, 64, resolution)
+    overlay.start_from(statistics)
+    matte, evidence = (t.detach().repeat_interleave(resolution, 0) for t in (overlay.matte(), overlay.evidence))
+    torch.testing.assert_close(matte[38:], torch.full_like(matte[38:], 0.99))
+    assert (matte[:12] <= 0.1 + 1e-6).all()
+    assert (evidence[38:] == 0).all()
+    assert (evidence[:12] == 1).all()
+    overlay.start_from(statistics, everywhere=True)
+    assert (overlay.matte() > 0.98).double().mean() > 0.45
+
+
 def test_black_white_and_constant_pixels_start_with_finite_logits() -> None:
     photo = torch.zeros(4, 6, 3, dtype=torch.uint8)
     photo[:, 3:] = 255
     overlay = ScreenSpaceOverlay(4, 6)
-    overlay.start_from(accumulate((photo, None) for _ in range(3)))
+    overlay.start_from(accumulate((photo, None) for _ in range(3)), everywhere=True)
     assert all(parameter.isfinite().all() for parameter in overlay.parameters())
     torch.testing.assert_close(overlay.matte(), torch.full((4, 6, 1), 0.99))
     assert (overlay.color()[:, :3] < 0.0021).all()
@@ -81,7 +101,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
     once[:2] = False
     never[:, :2] = False
     overlay = ScreenSpaceOverlay(4, 4, resolution)
-    overlay.start_from(accumulate([(photo, never), (photo, never & once)]))
+    overlay.start_from(accumulate([(photo, never), (photo, never & once)]), everywhere=True)
     color, matte = (t.detach().repeat_interleave(resolution, 0).repeat_interleave(resolution, 1) for t in (
         overlay.color(), overlay.matte()
     ))  # fmt: skip
@@ -95,7 +115,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
 def test_a_start_of_coarser_resolution_averages_the_premultiplied_colours() -> None:
     photos, statistics = capture(8, 12)
     overlay = ScreenSpaceOverlay(8, 12, 2)
-    overlay.start_from(statistics)
+    overlay.start_from(statistics, everywhere=True)
     values = photos / 255
     alpha = np.exp(-values.std(axis=0).max(axis=-1, keepdims=True) / 0.05)
     blocks = np.concatenate([alpha, alpha * values.mean(axis=0)], axis=-1).reshape(4, 2, 6, 2, 4).mean(axis=(1, 3))
@@ -109,7 +129,7 @@ def test_the_rows_that_fill_no_block_start_from_the_pixels_that_there_are(resolu
     photo = torch.zeros(9, 7, 3, dtype=torch.uint8)
     photo[8:], photo[:, 6:] = 204, 204
     overlay = ScreenSpaceOverlay(9, 7, resolution)
-    overlay.start_from(accumulate((photo, None) for _ in range(2)))
+    overlay.start_from(accumulate((photo, None) for _ in range(2)), everywhere=True)
     assert overlay.color().shape[:2] == (-(-9 // resolution), -(-7 // resolution))
     torch.testing.assert_close(overlay.color()[-1], torch.full_like(overlay.color()[-1], 0.8))
     torch.testing.assert_close(overlay.matte(), torch.full_like(overlay.matte(), 0.99))
