@@ -10,13 +10,15 @@ from torch import Tensor
 from ssa_nerfstudio.overlay.brightness import BrightnessBlocks
 
 _FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
+_MOST_IN_INT32 = 33_000
+"""Views of uint8 whose squares add up to less than 2^31."""
 
 
 class ImageStatistics:
     """Per-pixel mean and standard deviation of images of one size; memory does not depend on how many there are.
 
-    Integer images are summed in int64, which is exact; in float32, E[x^2] - E[x]^2 would cancel at the deviations of
-    0.05 that matter here. Floating-point images are summed in float64. The same pass keeps the brightness of blocks of
+    Integer images are summed in int64 (uint8 in int32 for as long as that holds them), which is exact; in float32,
+    E[x^2] - E[x]^2 would cancel at the deviations of 0.05 that matter here. Floating-point images are summed in float64. The same pass keeps the brightness of blocks of
     neighbouring views, on which detection is built.
     """
 
@@ -28,6 +30,7 @@ class ImageStatistics:
         self._squares: Tensor
         self._views: Tensor
         self._scale = 1.0
+        self._added = 0
         self._dtype: torch.dtype
 
     def add(self, image: Tensor, mask: Tensor | None = None) -> None:
@@ -45,7 +48,9 @@ class ImageStatistics:
             exact = image.dtype in _FULL_SCALE
             self._dtype = image.dtype
             self._scale = _FULL_SCALE.get(image.dtype, 1.0)
-            self._sum = torch.zeros(image.shape, dtype=torch.int64 if exact else torch.float64, device=image.device)
+            # int32 is half the memory traffic of int64, and is left for it when it gets full.
+            kind = torch.int32 if image.dtype == torch.uint8 else torch.int64 if exact else torch.float64
+            self._sum = torch.zeros(image.shape, dtype=kind, device=image.device)
             self._squares = torch.zeros_like(self._sum)
             self._views = torch.zeros(*image.shape[:2], 1, dtype=torch.int64, device=image.device)
             self.brightness = BrightnessBlocks(*image.shape[:2], device=image.device)
@@ -53,8 +58,7 @@ class ImageStatistics:
             raise ValueError(
                 f"image of {tuple(image.shape[:2])} {image.dtype} among images of {self.size} {self._dtype}"
             )
-        # uint8 fits into int32 when squared, at half the memory traffic of int64.
-        values = image.to(torch.int32 if image.dtype == torch.uint8 else self._sum.dtype)
+        values = image.to(self._sum.dtype)
         seen = None
         if mask is None:
             self._views += 1
@@ -62,8 +66,11 @@ class ImageStatistics:
             seen = (mask.reshape(*image.shape[:2], 1) != 0).to(image.device)
             self._views += seen
             values = torch.where(seen, values, torch.zeros_like(values))
+        if self._sum.dtype == torch.int32 and self._added == _MOST_IN_INT32:
+            self._sum, self._squares = self._sum.long(), self._squares.long()
+        self._added += 1
         self._sum += values
-        self._squares += values * values
+        self._squares.addcmul_(values, values)
         self.brightness.add(values, seen)
 
     @property
@@ -102,14 +109,14 @@ class ImageStatistics:
         views = self.views
         total = self._total()
         # n sum x^2 - (sum x)^2 is exact in int64: up to 1e7 views of uint8, 4e4 of uint16.
-        spread = (views * self._squares - total * total).clamp_min(0).to(torch.float64)
+        spread = (views * self._squares.to(total.dtype) - total * total).clamp_min(0).to(torch.float64)
         deviation = spread.sqrt() / (views.clamp_min(1) * self._scale)
         deviation = deviation.amax(dim=-1, keepdim=True)
         return torch.where(views > 1, deviation, torch.ones_like(deviation))
 
     def _total(self) -> Tensor:
         assert self._sum is not None
-        return self._sum
+        return self._sum.long() if self._sum.dtype == torch.int32 else self._sum
 
 
 def accumulate(views: Iterable[tuple[Tensor, Tensor | None]]) -> ImageStatistics:
