@@ -42,13 +42,13 @@ class Command:
         with TemporaryDirectory() as folder:
             trainers = [self._trainer(Path(folder) / str(guards), guards) for guards in (False, True)]
             times = np.array([[self._time(trainers[k], b) for k in (0, 1)] for b in range(self.blocks)])[2:]
-        ratios = times[:, 1] / times[:, 0]
-        draws = np.random.default_rng(0).choice(ratios, (10_000, len(ratios)))
+        percent = 100 * (times[:, 1] / times[:, 0] - 1)
+        draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
         low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
         without = 1e3 * np.median(times[:, 0]) / self.block
         print(
             f"{self.method}, overlay {self.overlay}, {versions()['device']}: {without:.3f} ms a step without guards; "
-            f"with them {100 * (np.median(ratios) - 1):+.2f} % (95 %: {100 * (low - 1):+.2f} to {100 * (high - 1):+.2f} %)"
+            f"with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
         )
 
     def _trainer(self, output: Path, guards: bool) -> SSATrainer:
