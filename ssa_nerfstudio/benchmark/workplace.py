@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import fcntl
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.holding import held
 
 
 @dataclass(frozen=True)
@@ -51,17 +50,6 @@ class Workplace:
         Raises:
             BadInput: another process holds it, or it cannot be written.
         """
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            lock = (self.folder / ".lock").open("w")
-        except OSError as error:
-            raise refuse(f"{self.folder} cannot be written ({error}); name another --output") from error
-        with lock:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError as error:
-                raise refuse(
-                    f"another ssa bench is at work in {self.folder}; wait for it, or name another --output"
-                ) from error
+        with held(self.folder, "ssa bench"):
             shutil.rmtree(self.folder / "running", ignore_errors=True)
             yield

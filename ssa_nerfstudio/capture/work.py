@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ssa_nerfstudio.errors import BadInput, refuse
+from ssa_nerfstudio.holding import held
 
 
 class Work:
@@ -46,26 +47,27 @@ class Work:
 
 @contextmanager
 def resumable_work(output: Path) -> Iterator[Work]:
-    """Work towards `output`; what a run leaves behind when it is killed, the next one finds.
+    """Work towards `output`, alone; what a run leaves behind when it is killed, the next one finds.
 
     A refusal removes the work, unless it is marked as kept.
 
     Raises:
-        BadInput: `output` exists or cannot be written.
+        BadInput: `output` exists or cannot be written, or another process works towards it.
     """
-    if output.exists():
-        raise refuse(f"{output} exists already; remove it or name another folder with --output")
     work = Work(output)
-    try:
-        work.folder.mkdir(parents=True, exist_ok=True)
-        yield work
-    except BadInput:
-        if not work.kept:
+    with held(work.folder, "ssa process"):
+        try:
+            # Only now: another process may have completed it before it let go of the work.
+            if output.exists():
+                raise refuse(f"{output} exists already; remove it or name another folder with --output")
+            yield work
+        except BadInput:
+            if not work.kept:
+                work.discard()
+            raise
+        except KeyboardInterrupt as error:
+            print(f"\nstopped; the same command goes on from the work in {work.folder}", file=sys.stderr)
+            raise SystemExit(130) from error
+        except OSError as error:
             work.discard()
-        raise
-    except KeyboardInterrupt as error:
-        print(f"\nstopped; the same command goes on from the work in {work.folder}", file=sys.stderr)
-        raise SystemExit(130) from error
-    except OSError as error:
-        work.discard()
-        raise refuse(f"{output} cannot be written ({error}); free space there or name another --output") from error
+            raise refuse(f"{output} cannot be written ({error}); free space there or name another --output") from error

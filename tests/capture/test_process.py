@@ -18,6 +18,7 @@ from small_captures import HEIGHT, WIDTH, photos, poses, write
 from ssa_nerfstudio.capture.alignment import centre_errors
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.effects.dashboard import Dashboard
+from ssa_nerfstudio.errors import BadInput
 
 VIEWS = 16
 
@@ -92,13 +93,18 @@ def test_the_dataset_is_the_one_that_nerfstudio_would_have_made_of_the_same_mode
 
 
 def test_a_killed_run_goes_on_where_it_was(tmp_path):
-    """A real process, killed with SIGKILL when its features are done; nothing of it looks like a dataset."""
+    """A real process, killed with SIGKILL when its features are done; nothing of it looks like a dataset.
+
+    While it runs, a second one is refused and leaves the work alone.
+    """
     write(tmp_path / "photos", photos(12))
     command = [sys.executable, "-m", "ssa_nerfstudio", "process", "--threads", "1"]
     command += ["--train", str(tmp_path / "photos"), "--output", str(tmp_path / "out")]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert running.stdout is not None
     next(line for line in running.stdout if line.startswith("features"))
+    with pytest.raises(BadInput, match="another ssa process is at work"):
+        process("--train", tmp_path / "photos", "--output", tmp_path / "out")
     running.kill()
     running.wait()
     assert not (tmp_path / "out").exists()
