@@ -83,9 +83,10 @@ class Structure:
         pairs = self._pairs()
         with pycolmap.Database.open(self._database) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
-            left = iter([pair for pair in pairs if not database.exists_two_view_geometry(*(ids[n] for n in pair))])
-        done = 0
-        while batch := list(islice(left, _PAIRS_A_CALL)):
+            left = [pair for pair in pairs if not database.exists_two_view_geometry(*(ids[n] for n in pair))]
+        done = len(pairs) - len(left)
+        batches = iter(left)
+        while batch := list(islice(batches, _PAIRS_A_CALL)):
             report("matches", done, len(pairs))
             Path(pairing.match_list_path).write_text("".join(f"{one} {other}\n" for one, other in batch))
             pycolmap.match_image_pairs(self._database, matching, pairing, geometry)
