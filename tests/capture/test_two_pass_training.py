@@ -1,4 +1,7 @@
-"""A capture in two passes from photos to figures: `ssa process`, `ns-train`, `ns-eval`, each as its own process."""
+"""A capture in two passes from photos to figures: `ssa process`, `ns-train`, `ns-eval`, each as its own process.
+
+And on from there: the matte that was learned is the mask of a second structure from motion.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from small_captures import HEIGHT, WIDTH, photos, write
 
+from ssa_nerfstudio.capture.process import MASK
+from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.effects.dashboard import Dashboard
 
 BIN = Path(sys.executable).parent
@@ -23,7 +29,7 @@ def run(*command: object) -> str:
     return done.stdout
 
 
-def test_artifact_photos_train_and_clean_photos_judge(tmp_path):
+def test_artifact_photos_train_and_clean_photos_judge_and_the_matte_is_a_mask_for_poses(tmp_path):
     layers = Dashboard().layers(HEIGHT, WIDTH, np.random.default_rng(0))
     pictures = photos(16)
     # No mask: what is the same in all photos is found by the command itself.
@@ -46,3 +52,17 @@ def test_artifact_photos_train_and_clean_photos_judge(tmp_path):
     # The clean render is nearer to the clean photos than the photo behind the dashboard that was trained on.
     assert results["psnr"] > 12
     assert results["psnr"] > results["composite_psnr"] + 1
+
+    overlay, again = tmp_path / "overlay", tmp_path / "again"
+    main(["export-overlay", "--load-config", str(config), "--raw-frame", "--output", str(overlay)])
+    mask = overlay / "mask_white_is_scene.png"
+    # Without flattening it is the mask alone that keeps the dashboard out of the poses.
+    main([
+        "process", "--train", str(train), "--clean", str(clean), "--output", str(again), "--mask", str(mask),
+        "--no-flatten", "--no-filter-stationary", "--threads", "1", "--min-registered", "0.9",
+    ])  # fmt: skip
+    used = np.asarray(Image.open(again / MASK))
+    covered = layers.transmittance.min(axis=-1) < 0.1
+    assert used.shape == (HEIGHT, WIDTH)
+    assert (~used)[covered].mean() > 0.9
+    assert used[~covered].mean() > 0.8
