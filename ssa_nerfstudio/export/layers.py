@@ -7,6 +7,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
+import scipy.ndimage
 import torch
 
 from ssa_nerfstudio.errors import refuse
@@ -15,6 +16,9 @@ from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.lens import Lens, distort, undistorted
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_groups import lens as lens_of
+
+_KNOWN = 0.999
+"""Weight of pixels of the undistorted frame in one of the raw frame: less is blended with what is not known."""
 
 
 @dataclass(frozen=True)
@@ -30,11 +34,26 @@ class ArtifactLayers:
     frame: Literal["undistorted", "raw"]
     """undistorted: the pixels that nerfstudio trains on; raw: those of the photos as they were taken."""
     kind: Literal["learned", "given"]
+    known: np.ndarray | None = None
+    """bool [H, W]: False where the crop of the undistorted frame left nothing of the raw one; None: all is known."""
 
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
         """Straight colour W [H, W, 3] and matte A [H, W, 1], both in [0, 1]."""
         color, alpha = straight_color(torch.from_numpy(self.transmittance), torch.from_numpy(self.addition))
         return color.numpy(), alpha.numpy()
+
+    def covered(self, threshold: float) -> np.ndarray:
+        """Where the matte exceeds the threshold, bool [H, W]; what is not known is as the nearest pixel that is.
+
+        A dashboard does not end where the undistorted frame does: structure from motion must not look there.
+        """
+        covered = self.straight()[1][..., 0] > threshold
+        if self.known is None or self.known.all():
+            return covered
+        y, x = np.asarray(
+            scipy.ndimage.distance_transform_edt(~self.known, return_distances=False, return_indices=True)
+        )
+        return covered[y, x]
 
     def sized(self, width: int, height: int) -> ArtifactLayers:
         """The same frame at another resolution, resampled bilinearly (reduced: by areas)."""
@@ -47,7 +66,10 @@ class ArtifactLayers:
         )
         c = self.camera
         camera = Lens(width, height, c.fx * across, c.fy * down, c.cx * across, c.cy * down, c.distortion, c.model)
-        return ArtifactLayers(transmittance, addition, camera, self.frame, self.kind)
+        known = self.known
+        if known is not None:
+            known = cv2.resize(known.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        return ArtifactLayers(transmittance, addition, camera, self.frame, self.kind, known)
 
 
 def undistorted_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
@@ -97,5 +119,6 @@ def raw_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
             )
         transmittance = distort(layers.transmittance, lens, 1.0)
         addition = distort(layers.addition, lens, 0.0)
-        result.append(ArtifactLayers(transmittance, addition, lens, "raw", layers.kind))
+        known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > _KNOWN
+        result.append(ArtifactLayers(transmittance, addition, lens, "raw", layers.kind, known))
     return result

@@ -66,7 +66,7 @@ def write_overlay(folder: Path, checkpoint: Checkpoint, layers: list[ArtifactLay
 
 def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dict[str, Any]:
     color, alpha = layers.straight()
-    artifact = alpha[..., 0] > threshold
+    artifact = layers.covered(threshold)
     straight = np.concatenate([color[..., ::-1], alpha], axis=-1)  # OpenCV's order
     _write_png(folder / "overlay.png", quantised(straight, np.uint8))
     _write_png(folder / "overlay_16bit.png", quantised(straight, np.uint16))

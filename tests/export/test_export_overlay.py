@@ -166,6 +166,20 @@ def test_the_raw_frame_is_that_of_the_photos(tmp_path, model):
     assert error.mean() < 2
 
 
+def test_masks_of_the_raw_frame_go_on_to_its_border(tmp_path):
+    """Nothing is learned of what undistortion crops away, but a dashboard does not end there."""
+    lens = LENSES["perspective"]
+    raw = draw("dashboard")
+    config = write_run(tmp_path / "run", one_camera(given(undistorted_layers(raw, lens)), lens))
+    export(config, tmp_path / "out", "--raw-frame")
+    artifact = np.asarray(Image.open(tmp_path / "out" / "mask_white_is_artifact.png")) > 0
+    true = raw.transmittance.min(axis=-1) < 0.5
+    assert true[-1].all()
+    assert artifact[-1].all()
+    assert (artifact != true).mean() < 0.03
+    assert read_rgba(tmp_path / "out" / "overlay.png")[-1, 0, 3] == 0
+
+
 @pytest.mark.parametrize(("effect", "highest"), [("watermark", 12), ("dashboard", 40)])
 def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(captures, tmp_path, effect, highest):
     t = json.loads((captures / "gopro_walk" / "transforms.json").read_text())
