@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -61,6 +62,7 @@ def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Se
         The folder of the model, or None where no two photos could be set against each other.
 
     Raises:
+        MemoryError: the child was killed from outside, which is what systems without memory left do.
         OSError: the child ended abnormally, which is how COLMAP tells that it cannot write.
     """
     job = {"images": str(images), "passes": [asdict(each) for each in passes], "settings": asdict(settings)}
@@ -85,6 +87,8 @@ def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Se
             child.wait()
             child.stdin.close()
             child.stdout.close()
+    if child.returncode == -signal.SIGKILL:
+        raise MemoryError("structure from motion was killed, most likely for lack of memory: lower --threads")
     if child.returncode:
         raise OSError(f"COLMAP: {_reason(log)}")
     return folder / MODEL if (folder / MODEL).is_dir() else None

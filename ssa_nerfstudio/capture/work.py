@@ -49,10 +49,10 @@ class Work:
 def resumable_work(output: Path) -> Iterator[Work]:
     """Work towards `output`, alone; what a run leaves behind when it is killed, the next one finds.
 
-    A refusal removes the work, unless it is marked as kept.
+    A refusal removes the work, unless it is marked as kept, or memory was all that lacked.
 
     Raises:
-        BadInput: `output` exists or cannot be written, or another process works towards it.
+        BadInput: `output` exists or cannot be written, another process works towards it, or memory ran out.
     """
     work = Work(output)
     with held(work.folder, "ssa process"):
@@ -68,6 +68,8 @@ def resumable_work(output: Path) -> Iterator[Work]:
         except KeyboardInterrupt as error:
             print(f"\nstopped; the same command goes on from the work in {work.folder}", file=sys.stderr)
             raise SystemExit(130) from error
+        except MemoryError as error:
+            raise refuse(f"{error}; the same command goes on from the work in {work.folder}") from error
         except OSError as error:
             work.discard()
             raise refuse(f"{output} cannot be written ({error}); free space there or name another --output") from error

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 from small_captures import HEIGHT, WIDTH, photos, write
@@ -108,6 +109,23 @@ def test_a_full_disk(blocks, tmp_path):
     (line,) = done.stderr.splitlines()
     assert "out cannot be written" in line
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_memory_that_runs_out_costs_no_work(tmp_path):
+    """As systems do it: the largest process, which is COLMAP's, is killed."""
+    write(tmp_path / "photos", photos(8))
+    command = [sys.executable, "-m", "ssa_nerfstudio", "process", "--threads", "1", "--train", "photos"]
+    running = subprocess.Popen(
+        [*command, "--output", "out"], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert running.stdout is not None
+    next(line for line in running.stdout if line.startswith("features"))
+    (child,) = psutil.Process(running.pid).children()
+    child.kill()
+    (line,) = running.communicate()[1].splitlines()
+    assert running.returncode == 2
+    assert "lack of memory" in line
+    assert list(tmp_path.glob(".out.work/motion/database.db"))
 
 
 def test_videos_of_two_sizes(tmp_path, capsys):
