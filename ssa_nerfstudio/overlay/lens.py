@@ -82,10 +82,10 @@ def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
     their straight colour must not be. Where the lens has no distortion the picture is returned as it is.
 
     Args:
-        image: uint8 or float32 [H, W, C] of the lens' size.
+        image: uint8 or float32 [H, W, C] or [H, W] of the lens' size.
 
     Returns:
-        [H', W', C] of `undistorted(lens)`'s size; 0 outside the raw frame, where photos are black too.
+        [H', W', C] or [H', W'] of `undistorted(lens)`'s size; 0 outside the raw frame, where photos are black too.
 
     Raises:
         ValueError: the image is not of the lens' size.
@@ -98,8 +98,8 @@ def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
         maps = cv2.fisheye.initUndistortRectifyMap(
             lens.matrix, lens.coefficients, np.eye(3), matrix, (lens.width, lens.height), cv2.CV_32FC1
         )
-        return cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR)
-    warped = cv2.undistort(image, lens.matrix, lens.coefficients, None, matrix)
+        return _with_channels(cv2.remap(image, *maps, interpolation=cv2.INTER_LINEAR), image)
+    warped = _with_channels(cv2.undistort(image, lens.matrix, lens.coefficients, None, matrix), image)
     return np.ascontiguousarray(warped[y : y + target.height, x : x + target.width])
 
 
@@ -107,12 +107,12 @@ def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
     """A picture of the undistorted frame, in the raw frame: the inverse of `undistort`, bilinear.
 
     Args:
-        image: uint8 or float32 [H', W', C] of `undistorted(lens)`'s size.
+        image: uint8 or float32 [H', W', C] or [H', W'] of `undistorted(lens)`'s size.
         lens: the raw frame's lens.
         fill: value where the crop left nothing to show: 1 for T and 0 for B leaves the photo there as it is.
 
     Returns:
-        [H, W, C] of the lens' size.
+        [H, W, C] or [H, W], as the image, of the lens' size.
 
     Raises:
         ValueError: the image is not of the undistorted size.
@@ -131,7 +131,8 @@ def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
         rays = cv2.undistortPointsIter(pixels, lens.matrix, lens.coefficients, np.eye(3), matrix, precise)
     places = (rays.reshape(lens.height, lens.width, 2) - (x, y)).astype(np.float32)
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (fill,) * 4}
-    return cv2.remap(image, places, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
+    warped = cv2.remap(image, places, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
+    return _with_channels(warped, image)
 
 
 @lru_cache(maxsize=256)
@@ -162,6 +163,11 @@ def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
         cy=float(matrix[1, 2]) - y + 0.5,
     )
     return target, matrix, (x, y)
+
+
+def _with_channels(warped: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """OpenCV drops the last dimension of [H, W, 1]: give it back, as the image has it."""
+    return warped.reshape(*warped.shape[:2], *image.shape[2:])
 
 
 def _check_size(image: np.ndarray, lens: Lens) -> None:

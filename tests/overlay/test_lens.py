@@ -114,6 +114,17 @@ def test_distort_is_the_inverse_of_undistort(model):
     assert np.abs(back - smooth)[known].max() < 0.01
 
 
+@pytest.mark.parametrize("channels", [(), (1,), (2,), (3,), (4,)])
+@pytest.mark.parametrize("model", ["perspective", "fisheye"])
+def test_both_warps_keep_the_channels(channels, model):
+    lens = Lens(53, 30, 28.0, 26.0, 26.0, 15.0, (-0.1, 0.01, 0, 0, 0, 0), model)
+    target = undistorted(lens)
+    raw = np.random.default_rng(0).random((30, 53, *channels), dtype=np.float32)
+    straight = undistort(raw, lens)
+    assert straight.shape == (target.height, target.width, *channels)
+    assert distort(straight, lens, fill=0.0).shape == raw.shape
+
+
 def test_a_cropped_corner_is_filled():
     target = undistorted(GOPRO_LIKE)
     ones = np.ones((target.height, target.width, 3), np.float32)
