@@ -12,6 +12,8 @@ FULL_LENGTH = 30_000
 """Steps that every schedule of splatfacto and 3DGS assumes."""
 SHORTEST_REFINEMENT = 10
 """Refinement is never more frequent than this many steps: its statistics need a few views to mean something."""
+SHORTEST_BETWEEN_PICTURES = 100
+"""Pictures in the log of a shorter run are never nearer to each other than this many steps: each is an evaluation."""
 
 _MODEL_STEPS = (
     "warmup_length",
@@ -27,7 +29,8 @@ def scaled(config: SSATrainerConfig) -> SSATrainerConfig:
     """A copy of a run's configuration with every schedule scaled by its number of steps / 30000.
 
     Scaled are: learning-rate decay and warm-up, the resolution schedule, spherical harmonics, the refinement's start,
-    stop and interval, and with the interval the opacity resets, which are counted in refinements.
+    stop and interval, and with the interval the opacity resets, which are counted in refinements; and, so that a short
+    run is seen too, the steps between two pictures in the log.
     """
     config = copy.deepcopy(config)
     factor = config.max_num_iterations / FULL_LENGTH
@@ -36,6 +39,8 @@ def scaled(config: SSATrainerConfig) -> SSATrainerConfig:
         steps = getattr(model, name)
         setattr(model, name, max(1, round(steps * factor)) if steps else 0)  # 0 switches a schedule off
     model.refine_every = max(SHORTEST_REFINEMENT, round(model.refine_every * factor))
+    pictures = max(SHORTEST_BETWEEN_PICTURES, round(config.steps_per_eval_image * factor))
+    config.steps_per_eval_image = min(config.steps_per_eval_image, pictures)  # 0 stays 0: none
     for entry in config.optimizers.values():
         scheduler = entry["scheduler"]
         if scheduler is not None:

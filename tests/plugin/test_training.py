@@ -237,6 +237,16 @@ def test_every_schedule_is_scaled_with_the_length_of_the_run():
     assert (full.warmup_length, config.optimizers["means"]["scheduler"].max_steps) == (500, 30_000)
 
 
+@pytest.mark.parametrize(
+    ("steps", "stated", "between"),
+    [(30_000, 5_000, 5_000), (2_000, 5_000, 333), (300, 5_000, 100), (2_000, 50, 50), (2_000, 0, 0)],
+)
+def test_a_shorter_run_is_seen_too(steps, stated, between):
+    config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    config.max_num_iterations, config.steps_per_eval_image = steps, stated
+    assert scaled(config).steps_per_eval_image == between
+
+
 def test_every_optimiser_is_scale_free():
     for config in METHODS.values():
         assert all(entry["optimizer"].eps == 1e-15 for entry in config.optimizers.values())
