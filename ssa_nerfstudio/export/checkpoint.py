@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.checkpoints import damage
 from ssa_nerfstudio.plugin.upstream import allow_checkpoint_scalars
 
 _MODEL = "_model."
@@ -56,7 +57,7 @@ class Checkpoint:
             state = {name.removeprefix("module."): value for name, value in saved["pipeline"].items()}
             at = int(saved["step"])
         except (RuntimeError, OSError, EOFError, UnpicklingError, KeyError, TypeError, AttributeError) as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            reason = damage(path) or (str(error) or type(error).__name__).splitlines()[0]
             raise refuse(f"{path} cannot be read as a checkpoint ({reason}); copy it again or train again") from error
         model = {name.removeprefix(_MODEL): value for name, value in state.items() if name.startswith(_MODEL)}
         if "gauss_params.means" not in model:

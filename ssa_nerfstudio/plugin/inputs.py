@@ -65,7 +65,7 @@ def check_transforms(data: Path) -> None:
     if not data.exists():
         raise refuse(f"{data} does not exist; give --data a folder that holds transforms.json and the photos")
     if not path.exists():
-        raise refuse(f"{path} does not exist; make it from photos with `ns-process-data images --data PHOTOS`")
+        raise refuse(f"{path} does not exist; give --data a folder that ns-process-data or ssa process made")
     try:
         frames = json.loads(path.read_text())["frames"]
     except (json.JSONDecodeError, UnicodeDecodeError) as error:

@@ -329,7 +329,7 @@ def test_foreign_and_broken_checkpoints_are_refused(tmp_path, capsys):
     for name, complaint in (
         ("nowhere", "does not exist"),
         ("empty", "holds no step-*.ckpt"),
-        ("broken", "cannot be read as a checkpoint"),
+        ("broken", "cannot be read as a checkpoint (File is not a zip file)"),
         ("nerf", "holds no Gaussian splats"),
         ("plain", "has no overlay"),
     ):
