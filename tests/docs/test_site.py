@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -36,6 +37,35 @@ def test_every_setting_of_the_model_is_in_the_site(site):
     page = (site / "configuration.html").read_text()
     for name in ("overlay-given", "sparsity-weight", "cap-max", "ignore-background"):
         assert f"<code>--pipeline.model.{name}</code>" in page
+
+
+def test_equations_are_drawn_by_the_browser_alone(site):
+    page = (site / "method.html").read_text()
+    equations = re.findall(r"<math.*?</math>", page, re.DOTALL)
+    assert sum('display="block"' in equation for equation in equations) >= 7
+    assert not [equation for equation in equations if "\\" in equation], "LaTeX that was not understood"
+    assert "$`" not in page
+    assert "language-math" not in page
+
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_module_that_a_page_names_exists(page):
+    named = re.findall(r"`((?:\w+/)+(?:\w+\.(?:py|yaml))?)`", page.read_text())
+    ours = [name for name in named if (ROOT / "ssa_nerfstudio" / name.split("/")[0]).exists() or name.endswith(".py")]
+    assert [name for name in ours if not any((root / name).exists() for root in (ROOT, ROOT / "ssa_nerfstudio"))] == []
+    modules = re.findall(r"python -m (ssa_nerfstudio(?:\.\w+)+)", page.read_text())
+    assert [name for name in modules if not (ROOT / (name.replace(".", "/") + ".py")).exists()] == []
+
+
+def test_the_architecture_names_every_room():
+    text = (ROOT / "docs/architecture.md").read_text()
+    package = ROOT / "ssa_nerfstudio"
+    rooms = {f"`{p.name}/`" for p in package.iterdir() if (p / "__init__.py").exists()}
+    rooms |= {f"`{p.name}`" for p in package.glob("*.py") if not p.name.startswith("__")}
+    assert [room for room in sorted(rooms) if room not in text] == []
 
 
 def test_the_site_fetches_nothing_from_the_internet(site):

@@ -1,0 +1,28 @@
+"""A hook of mkdocs: equations become MathML when the site is built, which browsers draw without scripts or fonts.
+
+Pages write them the way GitHub shows them: a block fenced as `math`, and inline a dollar sign around backticks.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from latex2mathml.converter import convert
+
+_BLOCK = re.compile(r"^```math\n(.*?)\n```$", re.MULTILINE | re.DOTALL)
+_INLINE = re.compile(r"\$`([^`\n]+)`\$")
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put MathML in the place of every equation."""
+    return _INLINE.sub(_inline, _BLOCK.sub(_block, markdown))
+
+
+def _block(found: re.Match[str]) -> str:
+    return f'\n<div style="overflow-x: auto; margin: 1em 0">{convert(found[1], display="block")}</div>\n'
+
+
+def _inline(found: re.Match[str]) -> str:
+    # In a span: Markdown takes a line that begins with <math> for a block.
+    return f"<span>{convert(found[1])}</span>"
