@@ -162,17 +162,18 @@ def main(arguments: list[str]) -> None:
             page.wait_for_timeout(6000)
             page.screenshot(path=output / "viewer-clean.png")
             page.get_by_label("Show overlay").click()
+            page.mouse.move(400, 350)  # away from the checkbox, whose hint would cover others
             page.wait_for_timeout(6000)
             page.screenshot(path=output / "viewer-overlay.png")
 
 
 def _look_at_the_scene(page: Page) -> None:
-    """Move from the viewer's first view towards the boxes, and leave out the logo, which is on the internet."""
+    """Orbit from the viewer's first view to where the boxes are, and leave out the logo, which is on the internet."""
     page.add_style_tag(content="img[alt='NerfStudio Logo'] { visibility: hidden }")
-    page.mouse.move(600, 500)
-    page.mouse.down(button="right")
-    page.mouse.move(330, 330, steps=8)
-    page.mouse.up(button="right")
+    page.mouse.move(400, 350)
+    page.mouse.down()
+    page.mouse.move(700, 350, steps=8)
+    page.mouse.up()
 
 
 if __name__ == "__main__":
