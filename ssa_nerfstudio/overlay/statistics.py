@@ -18,8 +18,8 @@ class ImageStatistics:
     """Per-pixel mean and standard deviation of images of one size; memory does not depend on how many there are.
 
     Integer images are summed in int64 (uint8 in int32 for as long as that holds them), which is exact; in float32,
-    E[x^2] - E[x]^2 would cancel at the deviations of 0.05 that matter here. Floating-point images are summed in float64. The same pass keeps the brightness of blocks of
-    neighbouring views, on which detection is built.
+    E[x^2] - E[x]^2 would cancel at the deviations of 0.05 that matter here. Floating-point images are summed in
+    float64. The same pass keeps the brightness of blocks of neighbouring views, on which detection is built.
     """
 
     brightness: BrightnessBlocks
