@@ -97,7 +97,7 @@ def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
 
 
 def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers], output: Path) -> Iterator[Recovery]:
-    """Take the artifact off photos and write them as PNG, each under its own name; `output/hidden` gets their masks.
+    """Take the artifact off photos and write them as PNG, each under its own name, with a mask for every size.
 
     Args:
         folder: what the photos' places in `output` are relative to.
