@@ -16,8 +16,8 @@ class Command:
     data: Path
     """A nerfstudio dataset (its training photos), a folder of photos or videos, or one video."""
     output: Path | None = None
-    """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Nothing is written
-    where it is not given."""
+    """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Where it is not given:
+    outputs/detection/NAME, replaced if it is there."""
     json: Path | None = None
     """File to write verdict, coverage, p_value, views and more of each camera to."""
     draws: int = 200
@@ -33,7 +33,7 @@ class Command:
         Raises:
             BadInput: the arguments or photos cannot be worked with.
         """
-        from contextlib import nullcontext
+        import shutil
 
         from rich.console import Console
 
@@ -46,12 +46,16 @@ class Command:
                 raise refuse(f"--{name} must be at least {lowest}, got {value}")
         if self.json is not None and not self.json.parent.is_dir():
             raise refuse(f"--json {self.json}: there is no folder {self.json.parent}; make it first")
+        if self.output is not None and self.output.exists():
+            raise refuse(f"{self.output} exists already; remove it or name another folder with --output")
+        output = self.output or Path("outputs/detection") / self.data.resolve().stem
         console = Console(highlight=False, soft_wrap=True)
-        with staged_folder(self.output) if self.output else nullcontext() as folder:
-            cameras = cameras_of(self.data, self.frames)
-            found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
-            if folder is not None:
-                write_detections(folder, found)
+        cameras = cameras_of(self.data, self.frames)
+        found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
+        if self.output is None:
+            shutil.rmtree(output, ignore_errors=True)
+        with staged_folder(output) as folder:
+            write_detections(folder, found)
         if self.json is not None:
             try:
                 self.json.write_text(as_json(found), encoding="utf-8")
@@ -68,5 +72,4 @@ class Command:
                 f"{camera}{detection.verdict}{covered} ({detection.views} views, p = {detection.p_value:.3g}, "
                 f"false alarms [{low:.3f}, {high:.3f}])"
             )
-        if self.output is not None:
-            console.print(f"{self.output}: evidence.png, and masks whose black is the artifact")
+        console.print(f"{output}: evidence.png, and masks whose black is the artifact")

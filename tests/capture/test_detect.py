@@ -90,6 +90,23 @@ def test_a_dataset_is_looked_at_camera_by_camera_and_only_where_it_trains(tiny_s
     assert sorted(p.name for p in (tmp_path / "found").iterdir()) == ["camera-1", "camera-2"]
 
 
+def test_without_an_output_the_last_result_of_that_name_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    photos(tmp_path / "walk", count=8)
+    for _ in range(2):
+        main(["detect", "--data", "walk"])
+    written = sorted(path.name for path in (tmp_path / "outputs/detection/walk").iterdir())
+    assert written == ["evidence.png", "mask_colmap.png", "mask_nerfstudio.png"]
+
+
+def test_an_output_that_exists_is_left_alone(tmp_path, capsys):
+    data = photos(tmp_path / "photos", count=8)
+    with pytest.raises(SystemExit) as refused:
+        main(["detect", "--data", str(data), "--output", str(tmp_path)])
+    assert refused.value.code == 2
+    assert "exists already" in capsys.readouterr().err
+
+
 def test_a_video_is_taken_too(tmp_path):
     data = photos(tmp_path / "photos", count=20)
     video = tmp_path / "walk.mp4"
@@ -98,7 +115,7 @@ def test_a_video_is_taken_too(tmp_path):
         writer.write(cv2.imread(str(data / f"photo_{number}.png")))
     writer.release()
     report = tmp_path / "found.json"
-    main(["detect", "--data", str(video), "--json", str(report)])
+    main(["detect", "--data", str(video), "--json", str(report), "--output", str(tmp_path / "found")])
     assert verdicts(report)[0]["verdict"] == "opaque"
 
 

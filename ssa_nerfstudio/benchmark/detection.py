@@ -1,0 +1,140 @@
+"""How often does detection find an artifact, and how often one that is not there?
+
+`python -m ssa_nerfstudio.benchmark.detection --data DIR DIR ...` puts each effect in front of the raw photos of each
+capture, with several seeds and numbers of views, and prints one row a capture and effect.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from rich.progress import track
+
+from ssa_nerfstudio.effects.composition import Composition
+from ssa_nerfstudio.overlay.detection import Detection, detect
+from ssa_nerfstudio.overlay.lens import undistort
+from ssa_nerfstudio.overlay.statistics import ImageStatistics
+from ssa_nerfstudio.simulation.dataset import Dataset, View
+from ssa_nerfstudio.simulation.photos import read_photo
+from ssa_nerfstudio.simulation.scene import Scene, read_effects
+
+
+def detections(dataset: Dataset, effect: str | None, seed: int, counts: tuple[int, ...]) -> list[Detection]:
+    """Detect with evenly spaced views of a capture, a new statistics for each number of views in one pass.
+
+    Args:
+        dataset: all its photos are clean and of one size.
+        effect: what to put in front; None: nothing.
+        seed: of the effect, and of detection's shifts.
+        counts: numbers of views, 0 for all; larger ones than there are views are left out.
+    """
+    views = dataset.views
+    chosen = [set(np.linspace(0, len(views) - 1, count or len(views)).round().astype(int)) for count in counts]
+    scene = Scene(read_effects((effect,)), seed) if effect else None
+    artifact = scene.draw(*views[0].size) if scene else None
+    all_statistics = [ImageStatistics() for _ in counts]
+    for number, view in enumerate(views):
+        if not any(number in members for members in chosen):
+            continue
+        photo = _read(dataset, view)
+        if scene is not None and artifact is not None:
+            photo = _behind(scene, artifact, photo, number)
+        for statistics, members in zip(all_statistics, chosen, strict=True):
+            if number in members:
+                statistics.add(torch.from_numpy(photo))
+    return [detect(statistics, seed=seed) for statistics in all_statistics]
+
+
+def rates(
+    dataset: Dataset, repeats: int, clock: Callable[[], float] = time.perf_counter
+) -> tuple[float, float, float, float]:
+    """Medians over interleaved turns, seconds for all photos: decode and undistort; statistics and blocks; the blocks
+    of brightness alone; the test at the end."""
+    turns = []
+    for _ in range(repeats):
+        statistics, seconds = ImageStatistics(), np.zeros(4)
+        for view in dataset.views:
+            started = clock()
+            photo = torch.from_numpy(undistort(_read(dataset, view), view.lens))
+            between = clock()
+            statistics.add(photo)
+            done = clock()
+            statistics.brightness.add(photo.to(torch.int32), None)
+            seconds[:3] += between - started, done - between, clock() - done
+        started = clock()
+        detect(statistics)
+        seconds[3] = clock() - started
+        turns.append(seconds)
+    prepared, summed, blocks, tested = np.median(turns, axis=0)
+    return float(prepared), float(summed), float(blocks), float(tested)
+
+
+def _read(dataset: Dataset, view: View) -> np.ndarray:
+    return np.array(read_photo(dataset.source(view.path), view.lens.width, view.lens.height))
+
+
+def _behind(scene: Scene, artifact: Composition, photo: np.ndarray, number: int) -> np.ndarray:
+    inside = artifact.view(scene.view_generators(artifact, number)) if artifact.box is not None else None
+    return artifact.apply(photo, inside)
+
+
+@dataclass
+class Command:
+    """Hits and false alarms of detection on clean captures and behind simulated artifacts."""
+
+    data: tuple[Path, ...]
+    """Clean nerfstudio datasets."""
+    effects: tuple[str, ...] = ("none", "watermark", "ui", "dashboard", "rain", "mud")
+    """Effects, each alone; none for the photos as they are."""
+    views: tuple[int, ...] = (12, 25, 50)
+    """Numbers of views; 0 for all."""
+    seeds: int = 5
+    """Draws of each effect and of detection's shifts."""
+    rate: bool = False
+    """Measure instead what detection costs beside decoding and undistorting."""
+
+    def run(self) -> None:
+        """Print a Markdown table."""
+        print("\n".join(self._rate_rows() if self.rate else self._rows()))
+
+    def _rows(self) -> Iterator[str]:
+        yield "| capture | effect | " + " | ".join(f"{count or 'all'} views" for count in self.views) + " |"
+        yield "|---|---|" + "---|" * len(self.views)
+        cases = [(data, effect) for data in self.data for effect in self.effects]
+        for data, effect in track(cases, "Detecting", transient=True):
+            dataset = Dataset.read(data, eval_interval=8)
+            counts = tuple(count for count in self.views if count <= len(dataset.views))
+            found = [
+                detections(dataset, None if effect == "none" else effect, seed, counts) for seed in range(self.seeds)
+            ]
+            cells = [_cell([run[k] for run in found]) for k in range(len(counts))]
+            cells += ["-"] * (len(self.views) - len(counts))
+            yield f"| `{data.name}` | {effect} | " + " | ".join(cells) + " |"
+
+    def _rate_rows(self) -> Iterator[str]:
+        yield "| capture | decode and undistort, ms a photo | statistics | of which detection's | test at the end, s |"
+        yield "|---|---|---|---|---|"
+        for data in self.data:
+            dataset = Dataset.read(data, eval_interval=8)
+            prepared, summed, blocks, tested = rates(dataset, repeats=3)
+            n = len(dataset.views) / 1000
+            yield f"| `{data.name}` | {prepared / n:.1f} | {summed / n:.1f} | {blocks / n:.1f} | {tested:.2f} |"
+
+
+def _cell(found: list[Detection]) -> str:
+    """Hits of all runs, the verdicts, and the covered share."""
+    hits = [one for one in found if one.verdict != "none"]
+    verdicts = "/".join(sorted({one.verdict for one in hits}))
+    covered = f", {verdicts}, {np.mean([one.coverage for one in hits]):.1%}" if hits else ""
+    return f"{len(hits)} of {len(found)}{covered}"
+
+
+if __name__ == "__main__":
+    import tyro
+
+    tyro.cli(Command).run()

@@ -1,0 +1,38 @@
+"""The table of hits and false alarms: its numbers are detection's, on the views it names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ssa_nerfstudio.benchmark.detection import Command, detections, rates
+from ssa_nerfstudio.demo.scene import DemoScene
+from ssa_nerfstudio.simulation.dataset import Dataset
+
+
+@pytest.fixture(scope="module")
+def clean(tmp_path_factory) -> Dataset:
+    folder = tmp_path_factory.mktemp("detection") / "scene"
+    DemoScene(views=14, test_views=2, width=96, height=72).write(folder, None)
+    return Dataset.read(folder, eval_interval=8)
+
+
+def test_views_are_counted_and_an_artifact_is_found_at_each_number(clean):
+    found = detections(clean, "dashboard", seed=0, counts=(8, 16))
+    assert [one.views for one in found] == [8, 16]
+    assert {one.verdict for one in found} == {"opaque"}
+    assert [one.verdict for one in detections(clean, None, seed=0, counts=(0,))] == ["none"]
+
+
+def test_the_table_has_a_row_for_each_effect_and_says_what_there_are_no_views_for(clean, capsys):
+    Command((clean.root,), effects=("none", "dashboard"), views=(12, 500), seeds=1).run()
+    lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("|")]
+    assert lines[-2:] == ["| `scene` | none | 0 of 1 | - |", lines[-1]]
+    assert lines[-1].startswith("| `scene` | dashboard | 1 of 1, opaque, ")
+
+
+def test_rates_are_medians_over_turns(clean):
+    ticks = iter(np.arange(100_000.0))
+    prepared, summed, blocks, tested = rates(clean, repeats=1, clock=lambda: next(ticks))
+    views = len(clean.views)
+    assert (prepared, summed, blocks, tested) == (views, views, views, 1)
