@@ -288,6 +288,17 @@ def _require_alive(model: SSASplatfactoModel, cause: Exception | None = None) ->
         raise Diverged("no Gaussian can be seen any more") from cause
 
 
+def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
+    """Settings of the model by field name, from name=value."""
+    model = {name: yaml.safe_load(value) for name, value in (setting.split("=", 1) for setting in settings)}
+    # YAML reads on and off as booleans.
+    if isinstance(model.get("overlay"), bool):
+        model["overlay"] = "on" if model["overlay"] else "off"
+    if "overlay_given" in model:
+        model["overlay_given"] = Path(model["overlay_given"])
+    return model
+
+
 @dataclass
 class Command:
     """One training, its figures written as JSON: `python -m ssa_nerfstudio.benchmark.run --data DIR --output FILE`."""
@@ -307,13 +318,8 @@ class Command:
 
     def run(self) -> None:
         """Train, evaluate, write."""
-        model = {name: yaml.safe_load(value) for name, value in (s.split("=", 1) for s in self.settings)}
-        # YAML reads on and off as booleans.
-        if isinstance(model.get("overlay"), bool):
-            model["overlay"] = "on" if model["overlay"] else "off"
-        if "overlay_given" in model:
-            model["overlay_given"] = Path(model["overlay_given"])
         folder = self.output.with_suffix("")
+        model = model_settings(self.settings)
         config = configure(self.method, self.data, folder, self.steps, model, self.scale_factor)
         outcome, _, path = train_and_evaluate(config)
         asked = {"method": self.method, "data": self.data.name, "steps": self.steps, "settings": list(self.settings)}
