@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-import torch.nn.functional as F
-from PIL import Image
 
 from ssa_nerfstudio.benchmark.real_artifact import undistorted_mask
 from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.overlay.lens import Lens, undistort
 
 pytestmark = pytest.mark.slow
 
