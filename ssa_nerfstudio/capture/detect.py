@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -20,13 +17,12 @@ from rich.progress import track
 
 from ssa_nerfstudio.capture.sources import Source, open_photo, read_source
 from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.ordered_work import in_order
 from ssa_nerfstudio.overlay.camera_groups import group_frames
 from ssa_nerfstudio.overlay.detection import DRAWS, EVIDENCE_NEEDED, Detection, detect
 from ssa_nerfstudio.overlay.statistics import accumulate
 from ssa_nerfstudio.simulation.dataset import Dataset, View
 from ssa_nerfstudio.simulation.photos import UnusableFile, read_photo
-
-Item = TypeVar("Item")
 
 LEAST_PHOTOS = 2
 """What stays the same in all photos takes more than one to see."""
@@ -59,7 +55,7 @@ def cameras_of(data: Path, frames: int) -> list[Camera]:
     source = read_source(data, "frame", least=LEAST_PHOTOS)
     if source.videos:
         return [Camera("camera-1", frames, lambda _: _frames(source, frames))]
-    return [Camera("camera-1", len(source.photos), partial(_decoded, source.photos, _read_upright))]
+    return [Camera("camera-1", len(source.photos), partial(in_order, _read_upright, source.photos))]
 
 
 def detect_camera(camera: Camera, threads: int, console: Console | None = None, draws: int = DRAWS) -> Detection:
@@ -138,7 +134,7 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
                 f"{data}: {members[0].path} is the only photo of its camera; what stays the same takes "
                 f"{LEAST_PHOTOS} to see: add photos or take it out"
             )
-        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(_decoded, members, read)))
+        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(in_order, read, members)))
     return cameras
 
 
@@ -155,22 +151,6 @@ def _read_upright(photo: Path) -> np.ndarray:
             return np.array(ImageOps.exif_transpose(image).convert("RGB"))
         except (OSError, SyntaxError, ValueError) as error:
             raise refuse(f"{photo} is broken ({error}); copy it again from its source or take it out") from error
-
-
-def _decoded(photos: Sequence[Item], read: Callable[[Item], np.ndarray], threads: int) -> Iterator[np.ndarray]:
-    """Photos in order; at most two a thread are in memory."""
-    pending = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for photo in photos:
-                pending.append(pool.submit(read, photo))
-                if len(pending) >= 2 * threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for job in pending:
-                job.cancel()
 
 
 def _evidence_picture(detection: Detection) -> np.ndarray:

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
-from typing import TypeVar
 
 import numpy as np
 
 from ssa_nerfstudio.effects.composition import Composition
 from ssa_nerfstudio.effects.layers import Layers
+from ssa_nerfstudio.ordered_work import in_order
 from ssa_nerfstudio.overlay.camera_groups import group_frames
 from ssa_nerfstudio.overlay.lens import Lens, undistort, undistorted
 from ssa_nerfstudio.simulation.dataset import Dataset, View
 from ssa_nerfstudio.simulation.layer_files import LayerFile, write_view
 from ssa_nerfstudio.simulation.photos import read_photo, write_photo
 from ssa_nerfstudio.simulation.scene import Scene
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 
 
 def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path, threads: int) -> Iterator[None]:
@@ -57,7 +52,7 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
             return inside
 
         mean = _Mean()
-        for inside in _in_order(work, [item for item in numbered if item[1].size == size], threads):
+        for inside in in_order(work, [item for item in numbered if item[1].size == size], threads):
             mean.add(inside)
             yield
         layers = artifact.whole(mean.value(), *size)
@@ -102,19 +97,3 @@ class _Mean:
         if self._sums is None:
             return None
         return Layers(*((total / self._count).astype(np.float32) for total in self._sums))
-
-
-def _in_order(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Results in the items' order; at most three a thread are in memory."""
-    pending = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        try:
-            for item in items:
-                pending.append(pool.submit(work, item))
-                if len(pending) > 2 * threads:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
-        finally:
-            for job in pending:
-                job.cancel()
