@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from rich.console import Console
 from rich.progress import track
 
 from ssa_nerfstudio.effects.composition import Composition
@@ -99,14 +100,15 @@ class Command:
     """Measure instead what detection costs beside decoding and undistorting."""
 
     def run(self) -> None:
-        """Print a Markdown table."""
-        print("\n".join(self._rate_rows() if self.rate else self._rows()))
+        """Print a Markdown table, each row when it is known."""
+        for row in self._rate_rows() if self.rate else self._rows():
+            print(row, flush=True)
 
     def _rows(self) -> Iterator[str]:
         yield "| capture | effect | " + " | ".join(f"{count or 'all'} views" for count in self.views) + " |"
         yield "|---|---|" + "---|" * len(self.views)
         cases = [(data, effect) for data in self.data for effect in self.effects]
-        for data, effect in track(cases, "Detecting", transient=True):
+        for data, effect in track(cases, "Detecting", transient=True, console=Console(stderr=True)):
             dataset = Dataset.read(data, eval_interval=8)
             counts = tuple(count for count in self.views if count <= len(dataset.views))
             found = [
