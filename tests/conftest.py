@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +40,14 @@ def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def broken_scene(tiny_scene: Path, tmp_path: Path) -> Path:
     """A copy of the tiny scene for a test to break."""
     return Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
+
+
+@pytest.fixture(autouse=True)
+def no_event_writers_left():
+    """nerfstudio keeps event writers in a global: one test's would go on writing into its folder in the next."""
+    yield
+    if "nerfstudio.utils.writer" in sys.modules:
+        sys.modules["nerfstudio.utils.writer"].EVENT_WRITERS.clear()
 
 
 def edit_transforms(scene: Path, **changes) -> None:

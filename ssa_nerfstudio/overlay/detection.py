@@ -103,9 +103,16 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
 
 
 def static_area(statistics: ImageStatistics) -> Tensor:
-    """Where an artifact would be, whatever the verdict: static edges and plain areas among them, [H, W] bool."""
+    """Where an artifact would be, whatever the verdict: static edges and plain areas among them, [H, W] bool.
+
+    Where there are too few static edges to report, they tell nothing of where an artifact is, and all of the frame may
+    be one: few views, or a finger without edges.
+    """
     moments = _moments(statistics)
-    return _area(statistics, [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments])[0]
+    fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
+    if _strength(_shares(fields)) < 1:
+        return torch.ones(statistics.size, dtype=torch.bool)
+    return _area(statistics, fields)[0]
 
 
 def _moments(statistics: ImageStatistics) -> list[Tensor]:

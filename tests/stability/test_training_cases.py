@@ -147,7 +147,7 @@ for _share in (1.0, 0.6, 0.3):
 @TRAINING.case("black photos", "Colours of 0, an SSIM of 0 over 0, a mean of 0.", 0)
 @TRAINING.case("white photos", "Colours of 1, and a background that explains everything.", 255)
 def _flat(value: int, folder: Path) -> None:
-    outcome, _ = train(dataset(folder / "scene", edit=repaint(value)))
+    outcome, _ = train(dataset(folder / "scene", edit=repaint(value)), overlay="on")
     assert outcome.metrics["composite_psnr"] > 15
 
 
