@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.checkpoints import damage
+from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, step_of
 from ssa_nerfstudio.plugin.upstream import allow_checkpoint_scalars
 
 _MODEL = "_model."
@@ -44,7 +44,7 @@ class Checkpoint:
         if not config.is_file():
             raise refuse(f"--load-config {config} does not exist; give the config.yml that ns-train wrote")
         folder = config.parent / _MODELS_FOLDER
-        found = {_step(path): path for path in folder.glob("step-*.ckpt")}
+        found = {step_of(path): path for path in newest_first(folder)}
         if step is not None and step not in found:
             there = ", ".join(map(str, sorted(found))) or "none"
             raise refuse(f"{folder} has no checkpoint of step {step}; there are {there}")
@@ -87,8 +87,3 @@ class Checkpoint:
         own = {name.removeprefix(prefix): v for name, v in self.model.items() if name.startswith(prefix)}
         artifacts.load_state_dict(own)
         return artifacts
-
-
-def _step(path: Path) -> int:
-    digits = path.stem.removeprefix("step-")
-    return int(digits) if digits.isdecimal() else -1
