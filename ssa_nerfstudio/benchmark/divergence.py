@@ -1,17 +1,18 @@
 """Does MCMC diverge behind an artifact, when, and by which parameter? `python -m ssa_nerfstudio.benchmark.divergence`
 
-Trains the same dataset four times, with the overlay and the guards off and on, and writes divergence.json and
-divergence.png: the largest scale, the share of living Gaussians and the norm of all gradients over the steps.
+Trains the same dataset four times, with the overlay and the guards off and on, writes a JSON file for each and draws
+all that lie in the folder: the largest scale, the share of living Gaussians and the norm of all gradients over the steps.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import random
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -35,7 +36,11 @@ class Command:
     data: Path
     """A nerfstudio dataset with an artifact in front (`ssa simulate --effects dashboard`)."""
     output: Path
-    """Folder for divergence.json, divergence.png and the runs."""
+    """Folder for a JSON file of each training, and for divergence.png."""
+    overlay: tuple[Literal["off", "on"], ...] = ("off", "on")
+    """Overlays to train with; several processes, one a GPU, can share the four trainings and the folder."""
+    guards: tuple[bool, ...] = (False, True)
+    """Guards to train with."""
     steps: int = 15_000
     """Training steps of each run; schedules are scaled to them."""
     cap_max: int = 300_000
@@ -48,15 +53,13 @@ class Command:
     def run(self) -> None:
         """Train, write, draw."""
         self.output.mkdir(parents=True, exist_ok=True)
-        runs = {}
-        for overlay in ("off", "on"):
-            for guards in (False, True):
-                name = f"overlay {overlay}, guards {'on' if guards else 'off'}"
-                runs[name] = self._train(overlay, guards)
-                print(f"{name}: {runs[name]['verdict']}")
-                asked = {"data": self.data.name, "steps": self.steps, "cap_max": self.cap_max, "every": self.every}
-                content = {**asked, "versions": versions(), "runs": runs}
-                (self.output / "divergence.json").write_text(json.dumps(content) + "\n")
+        for overlay, guards in itertools.product(self.overlay, self.guards):
+            run = self._train(overlay, guards)
+            print(f"{run['name']}: {run['verdict']}")
+            asked = {"data": self.data.name, "steps": self.steps, "cap_max": self.cap_max, "every": self.every}
+            path = self.output / f"{run['name'].replace(', ', '-').replace(' ', '-')}.json"
+            path.write_text(json.dumps({**asked, "versions": versions(), **run}) + "\n")
+        runs = [json.loads(path.read_text()) for path in sorted(self.output.glob("overlay-*.json"))]
         draw(runs, self.output / "divergence.png")
 
     def _train(self, overlay: str, guards: bool) -> dict[str, Any]:
@@ -103,10 +106,11 @@ class Command:
             verdict = f"{which} first not finite at step {steps[first]}"
         elif failure is not None:
             verdict = failure
-        return {"verdict": verdict, "failure": failure, "steps": steps, **series}
+        name = f"overlay {overlay}, guards {'on' if guards else 'off'}"
+        return {"name": name, "verdict": verdict, "failure": failure, "noted": steps, **series}
 
 
-def draw(runs: dict[str, dict[str, Any]], path: Path) -> None:
+def draw(runs: list[dict[str, Any]], path: Path) -> None:
     """Plot every run's three series over the steps (see `Command`)."""
     import matplotlib
 
@@ -115,9 +119,10 @@ def draw(runs: dict[str, dict[str, Any]], path: Path) -> None:
 
     figure, axes = pyplot.subplots(len(PANELS), 1, figsize=(9, 9), sharex=True, constrained_layout=True)
     for axis, (name, unit) in zip(axes, PANELS.items(), strict=True):
-        for (label, run), style in zip(runs.items(), ("-", "--", "-", "--"), strict=False):
+        for run in runs:
             values = [math.nan if v is None else v for v in run[name]]
-            axis.plot(run["steps"], values, style, label=f"{label}: {run['verdict'][:60]}", linewidth=1)
+            style = "--" if run["name"].endswith("guards on") else "-"
+            axis.plot(run["noted"], values, style, label=f"{run['name']}: {run['verdict'][:60]}", linewidth=1)
         axis.set_ylabel(f"{name}\n({unit})")
         if name != "alive share":
             axis.set_yscale("log")
