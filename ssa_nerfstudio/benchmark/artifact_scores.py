@@ -23,15 +23,15 @@ def true_layers(path: Path, camera: int, cameras: int) -> tuple[np.ndarray, np.n
 def score(overlay: ScreenSpaceOverlay, transmittance: np.ndarray, addition: np.ndarray) -> dict[str, float]:
     """Scores in the overlay's frame; truth of another size is averaged over areas.
 
-    An artifact that adds light without hiding any (T = 1: rain) has no matte that alone would be right: its true
-    matte is taken as max over channels of 1 - T and B, the least opacity with which A W can explain it.
+    An artifact that adds light without hiding any (T = 1: rain) has no matte that alone would be right: of the truth
+    and of what was learned, max over channels of 1 - T and B is taken, the least opacity with which A W can explain it.
 
     Args:
         overlay: what was learned.
         transmittance, addition: the truth [H, W, 3].
 
     Returns:
-        matte_error: mean absolute error of A; matte_iou: at 0.5; premultiplied_error: mean absolute error of A W
+        matte_error: mean absolute error of that; matte_iou: at 0.5; premultiplied_error: mean absolute error of A W
         against B; transmittance_error: of 1 - A against T.
     """
     transmitted, added = (layer.cpu().numpy() for layer in overlay.layers())
@@ -41,7 +41,7 @@ def score(overlay: ScreenSpaceOverlay, transmittance: np.ndarray, addition: np.n
         for layer in (transmittance, addition)
     )
     true_matte = np.maximum(1 - truth_t, truth_b).max(axis=2).clip(0, 1)
-    matte = torch.from_numpy(1 - transmitted[..., 0]).clamp(0, 1)
+    matte = torch.from_numpy(np.maximum(1 - transmitted[..., 0], added.max(axis=2))).clamp(0, 1)
     target = torch.from_numpy(np.ascontiguousarray(true_matte))
     return {
         "matte_error": metrics.matte_error(matte, target),

@@ -1,7 +1,7 @@
 """Does MCMC diverge behind an artifact, when, and by which parameter? `python -m ssa_nerfstudio.benchmark.divergence`
 
 Trains the same dataset four times, with the overlay and the guards off and on, writes a JSON file for each and draws
-all that lie in the folder: the largest scale, the share of living Gaussians and the norm of all gradients over the steps.
+those in the folder: the largest scale, the share of living Gaussians and the norm of all gradients over the steps.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ import torch
 from scipy.special import betaincinv
 from torch import Tensor, nn
 
+from ssa_nerfstudio.overlay.formation import adds_light
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
 DRAWS = 200
@@ -43,6 +44,8 @@ HALF_A_GREY_LEVEL = 0.5 / 255
 """Deviations below this are low in any capture."""
 OPAQUE_SHARE = 0.25
 """Share of the artifact's area that has to be opaque for that verdict."""
+NEAR = 16
+"""Working pixels around a static edge in which its artifact may go on: the inside of letters, thin mud."""
 EDGE_SUPPORT = 0.5
 """Share of an area's outline that has to be static edges: a plain artifact has them all around, a plain sky has not."""
 _AROUND = np.ones((3, 3), np.uint8)
@@ -102,17 +105,34 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
     return Detection(verdict, coverage, p_value, interval, views, shares, (fine, coarse), fields[0], mask)
 
 
-def static_area(statistics: ImageStatistics) -> Tensor:
-    """Where an artifact would be, whatever the verdict: static edges and plain areas among them, [H, W] bool.
+@dataclass(frozen=True)
+class StaticArea:
+    """Where an artifact would be, whatever the verdict, and of which kind: what an overlay starts from."""
 
-    Where there are too few static edges to report, they tell nothing of where an artifact is, and all of the frame may
-    be one: few views, or a finger without edges.
-    """
+    inside: Tensor
+    """[H, W] bool: static edges, and plain areas among them."""
+    near: Tensor
+    """[H, W] bool: that, and all within NEAR working pixels of a static edge."""
+    adds_light: bool
+    """The artifact shines and hides nothing (`formation.adds_light`)."""
+
+
+def static_area(statistics: ImageStatistics) -> StaticArea:
+    """The area of static edges; nothing where there are too few to report, everything where there are too few views."""
     moments = _moments(statistics)
     fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
+    if len(moments[0]) < LEAST_BLOCKS:
+        everything = torch.ones(statistics.size, dtype=torch.bool)
+        return StaticArea(everything, everything, False)
     if _strength(_shares(fields)) < 1:
-        return torch.ones(statistics.size, dtype=torch.bool)
-    return _area(statistics, fields)[0]
+        nothing = torch.zeros(statistics.size, dtype=torch.bool)
+        return StaticArea(nothing, nothing, False)
+    inside, _ = _area(statistics, fields)
+    edges = _edges(fields)
+    distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    near = inside | torch.from_numpy(_at_full_size(distance <= NEAR, statistics))
+    mean, deviation = _at_working_size(statistics.mean(), statistics), _deviation(statistics)
+    return StaticArea(inside, near, adds_light(mean.mean(axis=0), deviation, (edges > 0) & ~_low(deviation)))
 
 
 def _moments(statistics: ImageStatistics) -> list[Tensor]:
@@ -193,20 +213,44 @@ def _interval(reached: int, draws: int) -> tuple[float, float]:
 
 def _area(statistics: ImageStatistics, fields: list[Tensor]) -> tuple[Tensor, float]:
     """Static edges, widened, and the areas of low deviation among them, [H, W] bool; and the share that is opaque."""
-    height, width = statistics.size
-    reduction = statistics.brightness.reduction
+    edges, low = _edges(fields), _low(_deviation(statistics)).astype(np.uint8)
+    plain = _supported(low, cv2.dilate(edges, _AROUND, iterations=2))
+    mask = _at_full_size(cv2.dilate(edges, _AROUND) | plain, statistics)
+    return torch.from_numpy(mask), float((plain | (edges & low)).mean())
+
+
+def _edges(fields: list[Tensor]) -> np.ndarray:
+    """Static edges at the working resolution, uint8 [h, w]: the coarse ones where there are too few fine ones."""
     h, w = fields[0].shape
     fine, coarse = (
         (field >= needed).cpu().numpy().astype(np.uint8) for field, needed in zip(fields, EVIDENCE_NEEDED, strict=True)
     )
-    edges = fine if fine.mean() >= LEAST_SHARES[0] else np.kron(coarse, np.ones((COARSE, COARSE), np.uint8))[:h, :w]
-    deviation = statistics.deviation()[: h * reduction, : w * reduction].permute(2, 0, 1)[None].float()
-    deviation = nn.functional.avg_pool2d(deviation, reduction)[0, 0].cpu().numpy()
-    low = (deviation < max(LOW_DEVIATION * np.quantile(deviation, 0.75), HALF_A_GREY_LEVEL)).astype(np.uint8)
-    plain = _supported(low, cv2.dilate(edges, _AROUND, iterations=2))
-    mask = np.kron(cv2.dilate(edges, _AROUND) | plain, np.ones((reduction, reduction), np.uint8))
-    mask = np.pad(mask, ((0, height - h * reduction), (0, width - w * reduction)), mode="edge")
-    return torch.from_numpy(mask.astype(bool)), float((plain | (edges & low)).mean())
+    return fine if fine.mean() >= LEAST_SHARES[0] else np.kron(coarse, np.ones((COARSE, COARSE), np.uint8))[:h, :w]
+
+
+def _low(deviation: np.ndarray) -> np.ndarray:
+    """Where the views agree so far that an opaque artifact may be the reason, bool [h, w]."""
+    return deviation < max(LOW_DEVIATION * np.quantile(deviation, 0.75), HALF_A_GREY_LEVEL)
+
+
+def _deviation(statistics: ImageStatistics) -> np.ndarray:
+    return _at_working_size(statistics.deviation(), statistics)[0]
+
+
+def _at_working_size(layer: Tensor, statistics: ImageStatistics) -> np.ndarray:
+    """A layer [H, W, C] of the frame as [C, h, w]; rows and columns that fill no block are dropped."""
+    reduction = statistics.brightness.reduction
+    h, w = (side // reduction for side in statistics.size)
+    planes = layer[: h * reduction, : w * reduction].permute(2, 0, 1)[None].float()
+    return nn.functional.avg_pool2d(planes, reduction)[0].cpu().numpy()
+
+
+def _at_full_size(mask: np.ndarray, statistics: ImageStatistics) -> np.ndarray:
+    """A mask [h, w] at the working resolution as bool [H, W]."""
+    height, width = statistics.size
+    reduction = statistics.brightness.reduction
+    enlarged = np.kron(mask.astype(np.uint8), np.ones((reduction, reduction), np.uint8))
+    return np.pad(enlarged, ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1])), mode="edge") > 0
 
 
 def _supported(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """The artifact as a picture in front of every view: parameters, matte, compositing.
 
-Source: the paper, section "Modeling screen-space artifacts".
+Source: the paper, section "Modeling screen-space artifacts"; light that hides nothing is ours.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.detection import static_area
+from ssa_nerfstudio.overlay.detection import StaticArea
 from ssa_nerfstudio.overlay.resampling import (
     letterbox,
     reduced_size,
@@ -73,18 +73,40 @@ def composite_over_splats(
     return picture + (transmittance - transmittance.detach()) * without_background
 
 
+class _Clipped(torch.autograd.Function):
+    """Clip to [0, 1]; the gradient passes. A prediction beyond white is to be brought back, not left alone."""
+
+    @staticmethod
+    def forward(ctx, picture: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return picture.clamp(0.0, 1.0)
+
+    @staticmethod
+    def backward(ctx, v: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return v
+
+
+def clipped(picture: Tensor) -> Tensor:
+    """What a photo records of I = T C + B: [0, 1]. Its gradient is that of the identity."""
+    return _Clipped.apply(picture)  # pyright: ignore[reportReturnType]
+
+
 class ScreenSpaceOverlay(nn.Module):
-    """A learnable RGBA image shared by all views of one camera: W = sigmoid(W~), A = sigmoid(A~), one per pixel."""
+    """A learnable RGBA image shared by all views of one camera: W = sigmoid(W~), A = sigmoid(A~), one per pixel.
+
+    T = 1 - A and B = A W (paper); or, for an artifact that adds light, B = W, whatever A is.
+    """
 
     frame: Tensor
     evidence: Tensor
+    near: Tensor
 
-    def __init__(self, height: int, width: int, resolution: int = 1) -> None:
+    def __init__(self, height: int, width: int, resolution: int = 1, adds_light: bool = False) -> None:
         """Make an overlay for a frame, with the paper's constant start.
 
         Args:
             height, width: the camera's frame in pixels (undistorted).
             resolution: 1, 2 or 4: the overlay holds one pixel for a block of this side.
+            adds_light: what it adds does not depend on what it hides.
         """
         super().__init__()
         size = reduced_size(height, width, resolution)
@@ -92,21 +114,22 @@ class ScreenSpaceOverlay(nn.Module):
         self.color_logits = nn.Parameter(torch.full((*size, 3), color).logit())
         self.alpha_logits = nn.Parameter(torch.full((*size, 1), alpha).logit())
         # Lets a checkpoint say how large its overlay is, before any photo has been opened.
-        self.register_buffer("frame", torch.tensor([height, width, resolution]))
+        self.register_buffer("frame", torch.tensor([height, width, resolution, int(adds_light)]))
         self.register_buffer("evidence", torch.ones(*size, 1))
-        self.height, self.width, self.resolution = height, width, resolution
+        self.register_buffer("near", torch.ones(*size, 1))
+        self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
 
     @torch.no_grad()
-    def start_from(self, statistics: ImageStatistics, everywhere: bool = False) -> None:
+    def start_from(self, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
         """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05).
 
         A sky is as constant as a dashboard, but static edges enclose the dashboard alone. Outside of the area where
-        detection would see an artifact the matte starts at 0.1 at most (that of the constant start), and sparsity
-        weighs in full.
+        detection would see an artifact the matte starts at 0.1 at most (that of the constant start), far from its edges at
+        0.01, and sparsity weighs in full.
 
         Args:
             statistics: of the photos.
-            everywhere: as the paper has it: sigma decides alone.
+            area: where an artifact would be; None, as the paper has it: sigma decides alone.
 
         Raises:
             ValueError: where the statistics are of another frame.
@@ -117,9 +140,11 @@ class ScreenSpaceOverlay(nn.Module):
         # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the
         # pixel, is 1, and its mean colour would be lost.
         alpha = torch.exp(-deviation / STATISTICS_SCALE)
-        area = torch.ones_like(alpha) if everywhere else static_area(statistics).to(alpha)[..., None]
-        alpha = torch.where(area > 0, alpha, alpha.clamp_max(CONSTANT_START[1]))
-        pair = torch.cat([alpha, alpha * mean, deviation, area], dim=-1)
+        inside = torch.ones_like(alpha) if area is None else area.inside.to(alpha)[..., None]
+        near = torch.ones_like(alpha) if area is None else area.near.to(alpha)[..., None]
+        alpha = torch.where(inside > 0, alpha, alpha.clamp_max(CONSTANT_START[1]))
+        alpha = torch.where(near > 0, alpha, alpha.clamp_max(MATTE_START_RANGE[0]))
+        pair = torch.cat([alpha, alpha * mean, deviation, inside, near], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
             padded = nn.functional.pad(
@@ -128,10 +153,24 @@ class ScreenSpaceOverlay(nn.Module):
                 mode="replicate",
             )
             pair = nn.functional.avg_pool2d(padded, self.resolution)[0].permute(1, 2, 0)
-        alpha = pair[..., :1]
-        self.color_logits.copy_((pair[..., 1:4] / alpha).clamp(*COLOR_START_RANGE).logit())
-        self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
-        self.evidence.copy_(_evidence(pair[..., 4:5], pair[..., 5:]))
+        alpha = pair[..., :1].clamp(*MATTE_START_RANGE)
+        color = (pair[..., 1:4] / pair[..., :1]).clamp(*COLOR_START_RANGE)
+        self.color_logits.copy_((alpha * color if self.adds_light else color).logit())
+        self.alpha_logits.copy_(alpha.logit())
+        self.evidence.copy_(_evidence(pair[..., 4:5], pair[..., 5:6]))
+        self.near.copy_(pair[..., 6:] > 0)
+
+    @torch.no_grad()
+    def wait_for_the_scene(self) -> None:
+        """Keep the overlay at next to nothing far from static edges.
+
+        Early in a training the overlay explains anything constant (the sky ahead of a walk) sooner than Gaussians can.
+        What the scene has learned by itself when the wait is over, the overlay gains nothing by taking.
+        """
+        start = math.log(MATTE_START_RANGE[0] / (1 - MATTE_START_RANGE[0]))
+        self.alpha_logits.copy_(torch.where(self.near > 0, self.alpha_logits, start))
+        if self.adds_light:
+            self.color_logits.copy_(torch.where(self.near > 0, self.color_logits, start))
 
     @torch.no_grad()
     def keep_in_range(self) -> None:
@@ -140,12 +179,18 @@ class ScreenSpaceOverlay(nn.Module):
         self.color_logits.clamp_(*COLOR_LOGIT_RANGE)
 
     def color(self) -> Tensor:
-        """W: straight colour [h, w, 3] in (0, 1)."""
+        """W: straight colour, or the light that is added, [h, w, 3] in (0, 1)."""
         return torch.sigmoid(self.color_logits)
 
     def matte(self) -> Tensor:
         """A: opacity [h, w, 1] in (0, 1)."""
         return torch.sigmoid(self.alpha_logits)
+
+    def opacity(self) -> Tensor:
+        """What sparsity weighs, [h, w, 1]: A; of an artifact that adds light the largest of A and B."""
+        if self.adds_light:
+            return torch.sigmoid(torch.maximum(self.alpha_logits, self.color_logits.amax(dim=-1, keepdim=True)))
+        return self.matte()
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """Transmittance [H // reduction, W // reduction, 1] and added light [..., 3], averaged premultiplied.
@@ -153,7 +198,10 @@ class ScreenSpaceOverlay(nn.Module):
         Args:
             reduction: 1, 2 or 4: training images are reduced by this.
         """
-        transmittance, addition = stack_premultiplied(self.color(), self.matte())
+        if self.adds_light:
+            transmittance, addition = 1.0 - self.matte(), self.color()
+        else:
+            transmittance, addition = stack_premultiplied(self.color(), self.matte())
         if self.resolution == reduction == 1:
             return transmittance, addition
         pair = torch.cat([transmittance, addition], dim=-1)
@@ -185,7 +233,7 @@ class GivenOverlay(nn.Module):
         self.register_buffer("transmittance", transmittance.float())
         self.register_buffer("addition", addition.float())
         self.height, self.width = transmittance.shape[:2]
-        self.register_buffer("frame", torch.tensor([self.height, self.width, 1]))
+        self.register_buffer("frame", torch.tensor([self.height, self.width, 1, 0]))
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """T and B [H // reduction, W // reduction, 3], averaged."""
@@ -201,7 +249,7 @@ def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) 
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
 
 
-def _evidence(deviation: Tensor, area: Tensor) -> Tensor:
+def _evidence(deviation: Tensor, inside: Tensor) -> Tensor:
     """r: how much the sparsity weighs on a pixel, 1 outside the area of an artifact (its share of the pixel).
 
     Inside, r = min(1, sigma / 70th percentile of sigma), near 0 where the views agree, so that sparsity spares what an
@@ -212,4 +260,4 @@ def _evidence(deviation: Tensor, area: Tensor) -> Tensor:
     reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
     if reference <= 0:
         return torch.ones_like(deviation)
-    return 1 - area * (1 - (deviation / reference).clamp_max(1.0))
+    return 1 - inside * (1 - (deviation / reference).clamp_max(1.0))

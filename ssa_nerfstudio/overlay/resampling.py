@@ -82,8 +82,9 @@ def stack_premultiplied(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
 def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Tensor]:
     """Undo `stack_premultiplied`: (colour [..., 3], matte [..., 1]); black where the matte is zero.
 
-    The transmittance may have one channel or three; the matte is one minus its mean.
+    The transmittance may have one channel or three; the matte is one minus its mean. Light that hides nothing has no
+    straight colour: it gets the least matte that can carry it.
     """
-    alpha = 1.0 - transmittance.mean(dim=-1, keepdim=True)
+    alpha = torch.maximum(1.0 - transmittance.mean(dim=-1, keepdim=True), addition.amax(dim=-1, keepdim=True))
     color = torch.where(alpha > 0, addition / alpha.clamp_min(1e-6), torch.zeros_like(addition))
     return color.clamp(0.0, 1.0), alpha

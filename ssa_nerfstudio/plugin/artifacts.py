@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
+from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_groups import LENS_VALUES, find_frame, match_camera, nearest_aspect
 
 Overlay = ScreenSpaceOverlay | GivenOverlay
@@ -71,6 +72,11 @@ class Artifacts(nn.Module):
         place = torch.where(covered, covered.cumsum(0) - 1, -1).tolist()
         self._group_of_view = [place[group] if place[group] >= 0 else None for group in groups]
 
+    @property
+    def exceed_white(self) -> bool:
+        """Whether what they add can bring a picture beyond white, where a photo clips."""
+        return any(isinstance(overlay, GivenOverlay) or overlay.adds_light for overlay in self.overlays)
+
     def learned(self) -> list[ScreenSpaceOverlay]:
         """The overlays that have parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
@@ -97,7 +103,7 @@ class Artifacts(nn.Module):
     @torch.no_grad()
     def covered(self, group: int) -> tuple[Tensor, Tensor]:
         """Fraction of the frame with a matte above one half, and the mean matte, both on the device."""
-        alpha = 1.0 - self[group].layers()[0].mean(dim=-1)
+        _, alpha = straight_color(*self[group].layers())
         return (alpha > 0.5).float().mean(), alpha.mean()
 
     def figures(self, group: int) -> str:
@@ -120,7 +126,7 @@ class Artifacts(nn.Module):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
             if frames != here or (frames and given != isinstance(self[0], GivenOverlay)):
                 raise refuse(
-                    f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale) "
+                    f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale, adds light) "
                     f"{frames or 'absent'}, this run's are {here or 'absent'}; resume with the photos, "
                     "camera-res-scale-factor and overlay options it was trained with"
                 )
@@ -129,8 +135,10 @@ class Artifacts(nn.Module):
             raise refuse("the checkpoint has an overlay and this run has none; resume with --pipeline.model.overlay on")
         device = self.camera_keys.device
         self.overlays = nn.ModuleList(
-            GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3)) if given else ScreenSpaceOverlay(h, w, resolution)
-            for h, w, resolution in frames
+            GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3))
+            if given
+            else ScreenSpaceOverlay(h, w, resolution, bool(light))
+            for h, w, resolution, light in frames
         ).to(device)
         for name in ("camera_keys", "lenses", "bare_keys"):
             setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))

@@ -11,7 +11,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 
 from ssa_nerfstudio.errors import refuse
-from ssa_nerfstudio.overlay.detection import LEAST_BLOCKS, Detection, detect
+from ssa_nerfstudio.overlay.detection import LEAST_BLOCKS, Detection, detect, static_area
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
@@ -30,15 +30,20 @@ def learned_overlays(
     """
     overlays: list[ScreenSpaceOverlay | None] = []
     for group, size in enumerate(sizes):
-        overlay = ScreenSpaceOverlay(*size, config.overlay_downscale)
+        overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, config.overlay_light == "on")
         if config.overlay == "auto" or config.overlay_start != "constant":
             name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
             statistics = _look_at([photo for photo, at in zip(photos, groups, strict=True) if at == group], name)
             if config.overlay == "auto" and not _found(detect(statistics), name):
                 overlays.append(None)
                 continue
-            if config.overlay_start != "constant":
-                overlay.start_from(statistics, everywhere=config.overlay_start == "statistics")
+            if config.overlay_start == "detected":
+                area = static_area(statistics)
+                light = area.adds_light if config.overlay_light == "auto" else config.overlay_light == "on"
+                overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, light)
+                overlay.start_from(statistics, area)
+            elif config.overlay_start == "statistics":
+                overlay.start_from(statistics)
         overlays.append(overlay)
     return overlays
 

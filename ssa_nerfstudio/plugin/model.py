@@ -15,7 +15,7 @@ from torch.nn import Parameter
 
 from ssa_nerfstudio import metrics
 from ssa_nerfstudio.errors import warn
-from ssa_nerfstudio.overlay.layer import composite, composite_over_splats
+from ssa_nerfstudio.overlay.layer import clipped, composite, composite_over_splats
 from ssa_nerfstudio.overlay.losses import Sparsity, SSIMBody, photometric, sparsity
 from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.overlay.resampling import straight_color
@@ -41,13 +41,22 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
     overlay_start: Literal["detected", "statistics", "constant"] = "detected"
     """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); detected: that where static edges enclose it,
-    A = 0.1 at most elsewhere; constant: W = 0.5, A = 0.1 (the paper's ablation)."""
+    A = 0.1 at most around it and 0.01 elsewhere; constant: W = 0.5, A = 0.1 (the paper's ablation)."""
+    overlay_light: Literal["auto", "on", "off"] = "auto"
+    """Whether the artifact may add light without hiding the scene (rain, glare), I = (1 - A) C + W: auto asks the
+    photos where overlay_start is detected; off is the paper's I = (1 - A) C + A W."""
+    scene_head_start: int = 4_000
+    """Steps in which the overlay is learned near static edges only, where overlay_start is detected."""
     overlay_downscale: Literal[1, 2, 4] = 1
     """The overlay has one pixel for a block of this many pixels a side: 1, 1/2 or 1/4 of the photos' resolution."""
     sparsity: Sparsity = "log"
     """What keeps the overlay empty: log (concave, weighted by evidence), l1 (the paper's), off."""
     sparsity_weight: float = 0.05
     """Weight of the sparsity term, the paper's lambda_sparse; not negative."""
+    sparsity_end: float = 1.0
+    """Share of the weight that is left when sparsity_steps are over; it falls exponentially until then."""
+    sparsity_steps: int = 30_000
+    """Steps in which the weight falls."""
     ignore_background: bool = True
     """The overlay gains nothing by hiding background that no splat covers (a sky without points); the paper's does."""
     ssim: SSIMBody = "fused"
@@ -172,6 +181,9 @@ class SSASplatfactoModel(SplatfactoModel):
             guards.keep_scales_in_range(self.scales)
             for overlay in self.artifacts.learned():
                 overlay.keep_in_range()
+        if step < self.config.scene_head_start and self.config.overlay_start == "detected":
+            for overlay in self.artifacts.learned():
+                overlay.wait_for_the_scene()
         super().step_post_backward(step)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
@@ -221,13 +233,12 @@ class SSASplatfactoModel(SplatfactoModel):
             drawn["composite"] = composite_over_splats(
                 drawn["rgb"], drawn["accumulation"], drawn["background"], transmittance, addition
             )
-            return drawn
-        drawn["composite"] = composite(drawn["rgb"], transmittance, addition)
+        else:
+            drawn["composite"] = composite(drawn["rgb"], transmittance, addition)
+        if self.artifacts.exceed_white:
+            drawn["composite"] = clipped(drawn["composite"])
         if not self.training:
-            drawn["composite"] = drawn["composite"].clamp(0.0, 1.0)
             drawn["overlay_rgb"], drawn["overlay_alpha"] = straight_color(transmittance, addition)
-        elif self.config.overlay == "given":
-            drawn["composite"] = drawn["composite"].clamp(0.0, 1.0)
         return drawn
 
     def _render(self, camera: Cameras, width: int, height: int, reduction: int) -> dict[str, Any]:
@@ -300,8 +311,8 @@ class SSASplatfactoModel(SplatfactoModel):
             return losses
         learned = self.artifacts.learned()
         if learned and self.config.sparsity != "off":
-            terms = [sparsity(overlay.matte(), overlay.evidence, self.config.sparsity) for overlay in learned]
-            losses["sparsity"] = self.config.sparsity_weight * torch.stack(terms).mean()
+            terms = [sparsity(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
+            losses["sparsity"] = self._sparsity_weight() * torch.stack(terms).mean()
         if self.config.strategy == "mcmc":
             losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()
             losses["mcmc_scale_reg"] = self.config.mcmc_scale_regularizer * torch.exp(self.scales).mean()
@@ -313,6 +324,11 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def _sparsity_weight(self) -> float:
+        """The weight at this step."""
+        passed = min(1.0, self.step / max(1, self.config.sparsity_steps))
+        return self.config.sparsity_weight * self.config.sparsity_end**passed
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
         """PSNR against the photo, of the clean render and of the composite, and the number of Gaussians.

@@ -22,6 +22,8 @@ _MODEL_STEPS = (
     "stop_screen_size_at",
     "stop_split_at",
     "mcmc_stop_at",
+    "scene_head_start",
+    "sparsity_steps",
 )
 
 

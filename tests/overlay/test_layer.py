@@ -51,7 +51,7 @@ def test_a_new_overlay_has_the_constant_start_of_the_paper() -> None:
 def test_colour_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_over_0_05() -> None:
     photos, statistics = capture(9, 13)
     overlay = ScreenSpaceOverlay(9, 13)
-    overlay.start_from(statistics, everywhere=True)
+    overlay.start_from(statistics)
     values = photos / 255
     mean = np.clip(values.mean(axis=0), 1 / 510, 1 - 1 / 510)
     sigma = values.std(axis=0).max(axis=-1, keepdims=True)
@@ -73,13 +73,13 @@ def test_by_default_only_what_static_edges_enclose_starts_opaque(resolution: int
         photo[36:] = (40, 30, 20)
     statistics = accumulate((torch.from_numpy(photo), None) for photo in photos)
     overlay = ScreenSpaceOverlay(48, 64, resolution)
-    overlay.start_from(statistics)
+    overlay.start_from(statistics, static_area(statistics))
     matte, evidence = (t.detach().repeat_interleave(resolution, 0) for t in (overlay.matte(), overlay.evidence))
     torch.testing.assert_close(matte[38:], torch.full_like(matte[38:], 0.99))
-    assert (matte[:12] <= 0.1 + 1e-6).all()
+    torch.testing.assert_close(matte[:12], torch.full_like(matte[:12], 0.01))
     assert (evidence[38:] == 0).all()
     assert (evidence[:12] == 1).all()
-    overlay.start_from(statistics, everywhere=True)
+    overlay.start_from(statistics)
     assert (overlay.matte() > 0.98).double().mean() > 0.45
 
 
@@ -87,7 +87,7 @@ def test_black_white_and_constant_pixels_start_with_finite_logits() -> None:
     photo = torch.zeros(4, 6, 3, dtype=torch.uint8)
     photo[:, 3:] = 255
     overlay = ScreenSpaceOverlay(4, 6)
-    overlay.start_from(accumulate((photo, None) for _ in range(3)), everywhere=True)
+    overlay.start_from(accumulate((photo, None) for _ in range(3)))
     assert all(parameter.isfinite().all() for parameter in overlay.parameters())
     torch.testing.assert_close(overlay.matte(), torch.full((4, 6, 1), 0.99))
     assert (overlay.color()[:, :3] < 0.0021).all()
@@ -101,7 +101,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
     once[:2] = False
     never[:, :2] = False
     overlay = ScreenSpaceOverlay(4, 4, resolution)
-    overlay.start_from(accumulate([(photo, never), (photo, never & once)]), everywhere=True)
+    overlay.start_from(accumulate([(photo, never), (photo, never & once)]))
     color, matte = (t.detach().repeat_interleave(resolution, 0).repeat_interleave(resolution, 1) for t in (
         overlay.color(), overlay.matte()
     ))  # fmt: skip
@@ -115,7 +115,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
 def test_a_start_of_coarser_resolution_averages_the_premultiplied_colours() -> None:
     photos, statistics = capture(8, 12)
     overlay = ScreenSpaceOverlay(8, 12, 2)
-    overlay.start_from(statistics, everywhere=True)
+    overlay.start_from(statistics)
     values = photos / 255
     alpha = np.exp(-values.std(axis=0).max(axis=-1, keepdims=True) / 0.05)
     blocks = np.concatenate([alpha, alpha * values.mean(axis=0)], axis=-1).reshape(4, 2, 6, 2, 4).mean(axis=(1, 3))
@@ -129,7 +129,7 @@ def test_the_rows_that_fill_no_block_start_from_the_pixels_that_there_are(resolu
     photo = torch.zeros(9, 7, 3, dtype=torch.uint8)
     photo[8:], photo[:, 6:] = 204, 204
     overlay = ScreenSpaceOverlay(9, 7, resolution)
-    overlay.start_from(accumulate((photo, None) for _ in range(2)), everywhere=True)
+    overlay.start_from(accumulate((photo, None) for _ in range(2)))
     assert overlay.color().shape[:2] == (-(-9 // resolution), -(-7 // resolution))
     torch.testing.assert_close(overlay.color()[-1], torch.full_like(overlay.color()[-1], 0.8))
     torch.testing.assert_close(overlay.matte(), torch.full_like(overlay.matte(), 0.99))
@@ -144,13 +144,13 @@ def test_statistics_of_another_frame_are_refused() -> None:
 def test_evidence_is_the_deviation_over_its_70th_percentile_where_static_edges_are_and_one_elsewhere() -> None:
     photos, statistics = capture(10, 20)
     overlay = ScreenSpaceOverlay(10, 20)
-    overlay.start_from(statistics)
+    area = static_area(statistics)
+    overlay.start_from(statistics, area)
     sigma = (photos / 255).std(axis=0).max(axis=-1)
     reference = np.sort(sigma.ravel())[140 - 1]  # the 140th of 200
-    area = static_area(statistics).numpy()
-    expected = np.where(area, np.minimum(1, sigma / reference), 1)
+    expected = np.where(area.inside.numpy(), np.minimum(1, sigma / reference), 1)
     np.testing.assert_allclose(overlay.evidence[..., 0].numpy(), expected, atol=1e-6)
-    assert 0 < area.mean() < 1
+    assert 0 < area.inside.double().mean() < 1
     assert (overlay.evidence[1:-1, 0] == 0).all(), "pixels whose views agree are spared"
     assert "evidence" not in dict(overlay.named_parameters())
 
@@ -229,19 +229,19 @@ def test_the_scene_gets_the_share_of_the_gradient_that_the_matte_lets_through() 
     torch.testing.assert_close(clean.grad, (1 - overlay.matte()).expand(4, 5, 3))
 
 
+@pytest.mark.parametrize("adds_light", [False, True])
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_a_state_dict_brings_the_overlay_back(resolution: int) -> None:
+def test_a_state_dict_brings_the_overlay_back(resolution: int, adds_light: bool) -> None:
     _, statistics = capture(9, 13)
-    overlay = ScreenSpaceOverlay(9, 13, resolution)
+    overlay = ScreenSpaceOverlay(9, 13, resolution, adds_light)
     overlay.start_from(statistics)
     file = io.BytesIO()
     torch.save(overlay.state_dict(), file)
     file.seek(0)
     state = torch.load(file, weights_only=True)
-    height, width, found_resolution = state["frame"].tolist()
-    again = ScreenSpaceOverlay(height, width, found_resolution)
+    again = ScreenSpaceOverlay(*state["frame"].tolist())
     again.load_state_dict(state)
-    assert (again.height, again.width, again.resolution) == (9, 13, resolution)
+    assert (again.height, again.width, again.resolution, again.adds_light) == (9, 13, resolution, adds_light)
     assert torch.equal(again.evidence, overlay.evidence)
     for reduction in (1, 2, 4):
         for found, expected in zip(again.layers(reduction), overlay.layers(reduction), strict=True):
