@@ -6,6 +6,7 @@ Chromium is the system's own (Debian: apt install chromium) and draws WebGL in s
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -22,15 +23,24 @@ import numpy as np
 
 from ssa_nerfstudio.demo.scene import DemoScene
 from ssa_nerfstudio.effects.dashboard import Dashboard
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import refuse, warn
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Route
 
 _FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 _PATIENCE = 200
 """Seconds until a server has to answer: on a loaded machine most of them go into importing."""
 _STEPS = 600
+_ADAPTIVE_RATIO = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*[\w$]+\)")
+"""Where viser's page decides how many of the window's pixels it draws (0.2.7, which nerfstudio pins)."""
+
+_SCENE_HAS_ITS_WIDTH = """() => {
+    const before = window.widthBefore
+    window.widthBefore = document.querySelector("canvas[data-engine]").clientWidth
+    return window.widthBefore === before
+}"""
+"""The panel slides in, and the scene gets narrower meanwhile."""
 
 
 def find_chromium() -> str | None:
@@ -82,9 +92,11 @@ def viewer_page(browser: Browser, *command: str | Path, width: int = 1100, heigh
         try:
             _wait_for(f"http://127.0.0.1:{port}", process)
             page = browser.new_page(viewport={"width": width, "height": height})
+            _keep_resolution(page)
             page.goto(f"http://127.0.0.1:{port}", timeout=1000 * _PATIENCE)
             _wait_for_elements(page)
             page.get_by_role("button", name="Hide Train Cams").click()
+            page.wait_for_function(_SCENE_HAS_ITS_WIDTH, polling=500)
             yield page
             page.close()
         except RuntimeError as error:
@@ -93,6 +105,23 @@ def viewer_page(browser: Browser, *command: str | Path, width: int = 1100, heigh
         finally:
             process.kill()
             process.wait()
+
+
+def _keep_resolution(page: Page) -> None:
+    """Have the page draw every pixel of its window, as it does on a machine whose browser has a GPU.
+
+    Below 38 frames a second viser's page draws fewer pixels, step by step down to a fifth of the width, and stretches
+    them. WebGL in software is always slower: pictures would be the softer, the longer a page has been open.
+    """
+
+    def serve(route: Route) -> None:
+        answer = route.fetch()
+        script, count = _ADAPTIVE_RATIO.subn("window.devicePixelRatio", answer.text())
+        if count != 1:
+            warn("viser's page decides on its resolution in another way than 0.2.7 does; pictures may be soft")
+        route.fulfill(response=answer, body=script)
+
+    page.route("**/assets/index-*.js", serve)
 
 
 def _wait_for(address: str, process: subprocess.Popen) -> None:

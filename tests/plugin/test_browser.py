@@ -80,6 +80,13 @@ def test_the_artifact_appears_and_disappears(page, config):
     assert np.abs(first - hidden).mean() < 0.02
 
 
+def test_the_picture_does_not_become_softer_with_time(page):
+    # Software draws fewer frames a second than viser's page wants; it would have lowered its resolution meanwhile.
+    page.wait_for_timeout(3000)
+    drawn, shown = page.locator("canvas[data-engine]").evaluate("it => [it.width, it.clientWidth]")
+    assert drawn == pytest.approx(shown, abs=1)
+
+
 def test_the_figures_and_the_saved_picture_are_the_artifacts(page, config, tmp_path):
     overlay = Checkpoint.read(config).artifacts()
     page.get_by_text(overlay.figures(0)).wait_for(timeout=60_000)
