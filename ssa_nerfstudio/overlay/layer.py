@@ -124,8 +124,8 @@ class ScreenSpaceOverlay(nn.Module):
         """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05).
 
         A sky is as constant as a dashboard, but static edges enclose the dashboard alone. Outside of the area where
-        detection would see an artifact the matte starts at 0.1 at most (that of the constant start), far from its edges at
-        0.01, and sparsity weighs in full.
+        detection would see an artifact the matte starts at 0.1 at most (that of the constant start), far from its edges
+        at 0.01, and sparsity weighs in full.
 
         Args:
             statistics: of the photos.

@@ -126,8 +126,8 @@ class Artifacts(nn.Module):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
             if frames != here or (frames and given != isinstance(self[0], GivenOverlay)):
                 raise refuse(
-                    f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale, adds light) "
-                    f"{frames or 'absent'}, this run's are {here or 'absent'}; resume with the photos, "
+                    f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale, adds "
+                    f"light) {frames or 'absent'}, this run's are {here or 'absent'}; resume with the photos, "
                     "camera-res-scale-factor and overlay options it was trained with"
                 )
             return

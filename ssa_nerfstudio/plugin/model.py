@@ -51,12 +51,8 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """The overlay has one pixel for a block of this many pixels a side: 1, 1/2 or 1/4 of the photos' resolution."""
     sparsity: Sparsity = "log"
     """What keeps the overlay empty: log (concave, weighted by evidence), l1 (the paper's), off."""
-    sparsity_weight: float = 0.05
-    """Weight of the sparsity term, the paper's lambda_sparse; not negative."""
-    sparsity_end: float = 1.0
-    """Share of the weight that is left when sparsity_steps are over; it falls exponentially until then."""
-    sparsity_steps: int = 30_000
-    """Steps in which the weight falls."""
+    sparsity_weight: float = 0.02
+    """Weight of the sparsity term, lambda_sparse, not negative; the paper has 0.05, and 0.01 for mud."""
     ignore_background: bool = True
     """The overlay gains nothing by hiding background that no splat covers (a sky without points); the paper's does."""
     ssim: SSIMBody = "fused"
@@ -312,7 +308,7 @@ class SSASplatfactoModel(SplatfactoModel):
         learned = self.artifacts.learned()
         if learned and self.config.sparsity != "off":
             terms = [sparsity(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
-            losses["sparsity"] = self._sparsity_weight() * torch.stack(terms).mean()
+            losses["sparsity"] = self.config.sparsity_weight * torch.stack(terms).mean()
         if self.config.strategy == "mcmc":
             losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()
             losses["mcmc_scale_reg"] = self.config.mcmc_scale_regularizer * torch.exp(self.scales).mean()
@@ -324,11 +320,6 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
-
-    def _sparsity_weight(self) -> float:
-        """The weight at this step."""
-        passed = min(1.0, self.step / max(1, self.config.sparsity_steps))
-        return self.config.sparsity_weight * self.config.sparsity_end**passed
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
         """PSNR against the photo, of the clean render and of the composite, and the number of Gaussians.

@@ -23,7 +23,6 @@ _MODEL_STEPS = (
     "stop_split_at",
     "mcmc_stop_at",
     "scene_head_start",
-    "sparsity_steps",
 )
 
 
