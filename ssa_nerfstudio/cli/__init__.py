@@ -40,11 +40,11 @@ def main(arguments: list[str] | None = None) -> None:
         from ssa_nerfstudio.errors import refuse
 
         raise refuse(f"there is no command {name!r}; choose one of {', '.join(COMMANDS)} (ssa --help)")
-    import tyro
+    from ssa_nerfstudio.cli import arguments as options
 
     warnings.simplefilter("ignore", FutureWarning)  # libraries' own, at import: nothing that a user could act on
     command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
-    tyro.cli(command, args=rest, prog=f"ssa {name}", description=COMMANDS[name]).run()
+    options.read(command, rest, f"ssa {name}", COMMANDS[name]).run()
 
 
 def _usage() -> str:

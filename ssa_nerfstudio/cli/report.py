@@ -13,7 +13,7 @@ import tyro
 class Command:
     """Tables, paired differences and pictures from the results of `ssa bench`, as HTML and Markdown."""
 
-    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDERS")]
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDERS")] = ()
     """Output folders of `ssa bench`; several are added up."""
     output: Path | None = None
     """Folder of the report; `report` in the first folder where not given."""
