@@ -70,7 +70,9 @@ def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dic
     straight = np.concatenate([color[..., ::-1], alpha], axis=-1)  # OpenCV's order
     _write_png(folder / "overlay.png", quantised(straight, np.uint8))
     _write_png(folder / "overlay_16bit.png", quantised(straight, np.uint16))
-    np.save(folder / "overlay_premultiplied.npy", np.concatenate([alpha * color, alpha], axis=-1))
+    # Premultiplied, light that hides nothing has its place: colour above alpha.
+    hides = 1 - layers.transmittance.mean(axis=-1, keepdims=True)
+    np.save(folder / "overlay_premultiplied.npy", np.concatenate([layers.addition, hides], axis=-1))
     _write_png(folder / "matte.png", quantised(alpha, np.uint16))
     _write_png(folder / "mask_white_is_artifact.png", artifact.astype(np.uint8) * 255)
     _write_png(folder / "mask_white_is_scene.png", (~artifact).astype(np.uint8) * 255)
@@ -81,10 +83,19 @@ def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dic
         "overlay": layers.kind,
         "covered_fraction": float(artifact.mean()),
         "mean_matte": float(alpha.mean()),
-        # T per channel, or light where nothing is covered, as rain adds: no RGBA picture has that.
-        "lost_in_rgba_grey_levels": float(255 * np.abs(layers.addition - alpha * color).mean()),
+        "lost_in_rgba_grey_levels": 255 * _lost(layers, color, alpha),
         "intrinsics": asdict(layers.camera),
     }
+
+
+def _lost(layers: ArtifactLayers, color: np.ndarray, alpha: np.ndarray) -> float:
+    """Mean over pixels of the error of the RGBA picture in front of the scene, black or white, where it is larger.
+
+    T per channel, or light that hides nothing: no RGBA picture has that.
+    """
+    black = alpha * color - layers.addition
+    white = black + (1 - alpha) - layers.transmittance
+    return float(np.maximum(np.abs(black), np.abs(white)).mean())
 
 
 def quantised(values: np.ndarray, kind: type[np.unsignedinteger]) -> np.ndarray:

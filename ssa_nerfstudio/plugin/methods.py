@@ -80,7 +80,6 @@ ssa_splatfacto_paper = MethodSpecification(
         SSASplatfactoModelConfig(
             overlay="on",
             overlay_start="statistics",
-            overlay_light="off",
             sparsity="l1",
             sparsity_weight=0.05,
             background_color="black",

@@ -14,7 +14,7 @@ from nerfstudio.models.splatfacto import resize_image
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.detection import static_area
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, composite
+from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, clipped, composite
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 
 
@@ -210,16 +210,54 @@ def test_compositing_is_the_equation_of_the_paper(clean: float, color: float, al
     torch.testing.assert_close(drawn, torch.full_like(drawn, alpha * color + (1 - alpha) * clean))
 
 
+@pytest.mark.parametrize("adds_light", [False, True])
 @pytest.mark.parametrize("resolution", [1, 2])
 @pytest.mark.parametrize("reduction", [1, 2])
-def test_gradients_of_compositing_are_those_of_finite_differences(reduction: int, resolution: int) -> None:
+def test_gradients_of_compositing_are_those_of_finite_differences(
+    reduction: int, resolution: int, adds_light: bool
+) -> None:
     overlay = randomised(5, 6, resolution).double()
+    overlay.adds_light = adds_light
     clean = random(5 // reduction, 6 // reduction, 3, dtype=torch.float64).requires_grad_()
 
     def drawn(clean: Tensor, *_: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return composite(clean, *overlay.layers(reduction)), overlay.matte(), overlay.color()
+        return composite(clean, *overlay.layers(reduction)), overlay.opacity(), overlay.color()
 
     assert torch.autograd.gradcheck(drawn, (clean, *overlay.parameters()))
+
+
+def test_what_adds_light_need_not_hide_and_weighs_what_it_adds() -> None:
+    overlay = ScreenSpaceOverlay(2, 3, adds_light=True).double()
+    with torch.no_grad():
+        overlay.alpha_logits.fill_(-12.0)
+        overlay.color_logits.copy_(torch.tensor([0.3, 0.2, 0.1]).logit().expand(2, 3, 3))
+    clean = random(2, 3, 3, dtype=torch.float64)
+    added = torch.tensor([0.3, 0.2, 0.1], dtype=torch.float64).expand(2, 3, 3)
+    torch.testing.assert_close(composite(clean, *overlay.layers()), clean + added, rtol=0, atol=1e-5)
+    torch.testing.assert_close(overlay.opacity(), added[..., :1])
+
+
+def test_a_prediction_beyond_white_is_recorded_as_white_and_brought_back() -> None:
+    picture = torch.tensor([-0.5, 0.2, 1.5], requires_grad=True)
+    recorded = clipped(picture)
+    assert recorded.tolist() == pytest.approx([0.0, 0.2, 1.0])
+    (recorded - 0.9).abs().sum().backward()
+    assert picture.grad is not None
+    assert picture.grad.tolist() == [-1.0, -1.0, 1.0]
+
+
+@pytest.mark.parametrize("adds_light", [False, True])
+def test_while_the_scene_goes_ahead_nothing_is_learned_far_from_static_edges(adds_light: bool) -> None:
+    overlay = randomised(4, 6)
+    overlay.adds_light = adds_light
+    overlay.near[:, 3:] = 0
+    before = [layer.detach().clone() for layer in overlay.layers()]
+    overlay.wait_for_the_scene()
+    transmittance, addition = (layer.detach() for layer in overlay.layers())
+    assert torch.equal(transmittance[:, :3], before[0][:, :3])
+    assert torch.equal(addition[:, :3], before[1][:, :3])
+    assert (1 - transmittance[:, 3:]).max() < 0.011
+    assert addition[:, 3:].max() < 0.011
 
 
 def test_the_scene_gets_the_share_of_the_gradient_that_the_matte_lets_through() -> None:

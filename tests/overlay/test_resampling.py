@@ -98,6 +98,13 @@ def test_where_the_matte_is_zero_the_colour_is_black_and_a_coloured_transmittanc
     assert alpha.item() == pytest.approx(0.6)
 
 
+def test_light_that_hides_nothing_gets_the_least_matte_that_carries_it() -> None:
+    added = torch.tensor([[[0.3, 0.2, 0.0]]])
+    color, alpha = straight_color(torch.ones(1, 1, 1), added)
+    assert alpha.item() == pytest.approx(0.3)
+    torch.testing.assert_close(alpha * color, added)
+
+
 @settings(max_examples=80, deadline=None)
 @given(height=sides, width=sides, into_height=sides, into_width=sides)
 def test_a_letterbox_never_stretches_and_leaves_its_bars_clear(

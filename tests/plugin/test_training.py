@@ -12,6 +12,7 @@ import torch
 from conftest import edit_transforms
 from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.eval_utils import eval_setup
+from PIL import Image
 
 from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
 from ssa_nerfstudio.effects.dashboard import Dashboard
@@ -113,7 +114,9 @@ def test_training_twice_gives_the_same_scene(tiny_scene, tmp_path):
     assert all(torch.equal(x, b.model.state_dict()[name]) for name, x in a.model.state_dict().items())
 
 
-@pytest.mark.parametrize("model", [{}, {"overlay": "off"}, {"strategy": "mcmc", "cap_max": 4200}])
+@pytest.mark.parametrize(
+    "model", [{}, {"overlay": "off"}, {"overlay_light": "on"}, {"strategy": "mcmc", "cap_max": 4200}]
+)
 def test_a_resumed_run_finishes_the_run_and_trains_what_it_loaded(tiny_scene, tmp_path, model):
     config = configure("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
     config.max_num_iterations = 10
@@ -153,6 +156,7 @@ def test_every_method_trains_at_full_and_reduced_resolution(tiny_scene, tmp_path
         {"overlay_downscale": 2, "num_downscales": 1},
         {"overlay_downscale": 4},
         {"overlay_start": "constant", "sparsity": "l1"},
+        {"overlay_start": "constant", "overlay_light": "on"},
         {"sparsity": "off"},
         {"use_bilateral_grid": True},
         {"background_color": "white", "rasterize_mode": "antialiased"},
@@ -178,6 +182,24 @@ def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path
     # One step of Adam moves every logit by 0.005.
     drift = pipeline.model.artifacts.learned()[0].alpha_logits.detach() - expected.logit()
     assert drift.abs().max() < 0.0051
+
+
+def test_light_in_front_of_the_photos_is_recognised_learned_and_reloaded(broken_scene, tmp_path):
+    """Spots that add to the scene: the model adds light, clips as a photo does, and a reloaded one still does."""
+    rng = np.random.default_rng(0)
+    spots = np.zeros((48, 64, 3), np.uint8)
+    for y, x in rng.integers(2, (46, 62), (40, 2)):
+        spots[y - 1 : y + 2, x - 1 : x + 2] = (70, 60, 50)
+    names = json.loads((broken_scene / "transforms.json").read_text())["train_filenames"]
+    for name in names:
+        with Image.open(broken_scene / name) as photo:
+            clean = np.asarray(photo.convert("RGB"))
+        Image.fromarray((clean.astype(int) + spots).clip(0, 255).astype(np.uint8)).save(broken_scene / name)
+    _, pipeline, config = run(broken_scene, tmp_path, 4, overlay="on")
+    assert pipeline.model.artifacts.learned()[0].adds_light
+    _, reloaded, _, _ = eval_setup(config, test_mode="inference")
+    assert reloaded.model.artifacts.learned()[0].adds_light
+    assert reloaded.model.artifacts.exceed_white
 
 
 def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path):
