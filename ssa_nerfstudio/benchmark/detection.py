@@ -1,7 +1,8 @@
 """How often does detection find an artifact, and how often one that is not there?
 
 `python -m ssa_nerfstudio.benchmark.detection --data DIR DIR ...` puts each effect in front of the raw photos of each
-capture, with several seeds and numbers of views, and prints one row a capture and effect.
+capture, with several seeds and numbers of views, and prints one row a capture and effect. With `--contiguous` the views
+are neighbours, as in a short clip, where a scene has had least time to move.
 """
 
 from __future__ import annotations
@@ -25,20 +26,29 @@ from ssa_nerfstudio.simulation.photos import read_photo
 from ssa_nerfstudio.simulation.scene import Scene, read_effects
 
 
-def detections(dataset: Dataset, effect: str | None, seed: int, counts: tuple[int, ...]) -> list[Detection]:
-    """Detect with evenly spaced views of a capture, a new statistics for each number of views in one pass.
+def spread(total: int, count: int) -> set[int]:
+    """Numbers of evenly spaced views, 0 for all."""
+    return set(np.linspace(0, total - 1, count or total).round().astype(int).tolist())
+
+
+def stretches(total: int, count: int) -> list[set[int]]:
+    """Numbers of neighbouring views at the beginning, in the middle and at the end of a capture."""
+    return [set(range(start, start + count)) for start in (0, (total - count) // 2, total - count)]
+
+
+def detections(dataset: Dataset, effect: str | None, seed: int, chosen: list[set[int]]) -> list[Detection]:
+    """Detect with some of a capture's views, a new statistics for each choice in one pass.
 
     Args:
         dataset: all its photos are clean and of one size.
         effect: what to put in front; None: nothing.
         seed: of the effect, and of detection's shifts.
-        counts: numbers of views, 0 for all; larger ones than there are views are left out.
+        chosen: numbers of the views, from 0, of each choice.
     """
     views = dataset.views
-    chosen = [set(np.linspace(0, len(views) - 1, count or len(views)).round().astype(int)) for count in counts]
     scene = Scene(read_effects((effect,)), seed) if effect else None
     artifact = scene.draw(*views[0].size) if scene else None
-    all_statistics = [ImageStatistics() for _ in counts]
+    all_statistics = [ImageStatistics() for _ in chosen]
     for number, view in enumerate(views):
         if not any(number in members for members in chosen):
             continue
@@ -93,7 +103,9 @@ class Command:
     effects: tuple[str, ...] = ("none", "watermark", "ui", "dashboard", "rain", "mud")
     """Effects, each alone; none for the photos as they are."""
     views: tuple[int, ...] = (12, 25, 50)
-    """Numbers of views; 0 for all."""
+    """Numbers of views; 0 for all, unless contiguous."""
+    contiguous: bool = False
+    """Views that are neighbours: the first, the middle and the last so many. Otherwise spread evenly."""
     seeds: int = 5
     """Draws of each effect and of detection's shifts."""
     rate: bool = False
@@ -110,12 +122,15 @@ class Command:
         cases = [(data, effect) for data in self.data for effect in self.effects]
         for data, effect in track(cases, "Detecting", transient=True, console=Console(stderr=True)):
             dataset = Dataset.read(data, eval_interval=8)
-            counts = tuple(count for count in self.views if count <= len(dataset.views))
-            found = [
-                detections(dataset, None if effect == "none" else effect, seed, counts) for seed in range(self.seeds)
+            total = len(dataset.views)
+            choices = [
+                [] if count > total else stretches(total, count) if self.contiguous else [spread(total, count)]
+                for count in self.views
             ]
-            cells = [_cell([run[k] for run in found]) for k in range(len(counts))]
-            cells += ["-"] * (len(self.views) - len(counts))
+            chosen = [views for at in choices for views in at]
+            name = None if effect == "none" else effect
+            runs = [iter(detections(dataset, name, seed, chosen)) for seed in range(self.seeds)]
+            cells = [_cell([next(run) for run in runs for _ in at]) if at else "-" for at in choices]
             yield f"| `{data.name}` | {effect} | " + " | ".join(cells) + " |"
 
     def _rate_rows(self) -> Iterator[str]:

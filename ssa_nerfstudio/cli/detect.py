@@ -38,7 +38,7 @@ class Command:
         from rich.console import Console
 
         from ssa_nerfstudio.capture.detect import as_json, cameras_of, detect_camera, write_detections
-        from ssa_nerfstudio.overlay.detection import LEAST_BLOCKS
+        from ssa_nerfstudio.overlay.detection import LEAST_VIEWS
         from ssa_nerfstudio.simulation.staging import staged_folder
 
         for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
@@ -64,8 +64,8 @@ class Command:
         for name, detection in found.items():
             low, high = detection.p_interval
             camera = f"{name}: " if len(found) > 1 else ""
-            if detection.views < LEAST_BLOCKS:
-                console.print(f"{camera}{detection.views} views are too few to tell; {LEAST_BLOCKS} are needed")
+            if detection.views < LEAST_VIEWS:
+                console.print(f"{camera}{detection.views} views are too few to tell; {LEAST_VIEWS} are needed")
                 continue
             covered = f", {detection.coverage:.1%} of the frame" if detection.verdict != "none" else ""
             console.print(

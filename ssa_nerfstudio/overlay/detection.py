@@ -1,9 +1,11 @@
 """Is there a static artifact, and where: a test on what the views have in common, with a null from the capture itself.
 
 The edges of a scene move from view to view, and at a fixed pixel their gradients average out; the edges of an artifact
-stay. The evidence of a pixel is the length of its mean gradient over its standard error. How much evidence chance and
-habit (a horizon at the same height, an object always in the middle, vignetting) bring about is learned from the
-capture: its views, shifted at random by a few pixels, keep all of that and lose only what stays in place to the pixel.
+stay. The evidence of a pixel is the length of its mean gradient over its standard error. A distant scene hardly moves
+during a short walk, but what moves of it moves together: where blocks of views differ as if their mean were displaced,
+edges do not count. How much evidence chance and habit (a horizon at the same height, an object always in the middle,
+vignetting) bring about is learned from the capture: its views, shifted at random by a few pixels, keep all of that and
+lose only what stays in place to the pixel.
 docs/detect.md derives it.
 """
 
@@ -32,16 +34,23 @@ COARSE = 4
 """The second scale: this many working pixels a side, for soft edges (a finger, thick drops)."""
 LEAST_SHARES = (0.003, 0.015)
 """Share of static edges above the null's mean, at the fine and the coarse scale, below which nothing is reported."""
+WINDOWS = (21, 11)
+"""Side of the window in which a displacement is fitted, pixels at the fine and at the coarse scale; odd."""
+DISPLACED_SHARES = (0.03, 0.05)
+"""Where displacements explain more of the blocks' deviations than this (fine, coarse), edges move and do not count."""
+STILL_SHARE = 0.1
+"""Connected static edges belong to the artifact if this share of them does not move: where it is soft, or beside a
+distant scene, an artifact's own edge seems to move in places (hysteresis, as in Canny's edges)."""
 LARGEST_SHIFT = 16
 """Views are shifted by up to this many working pixels in each direction, in steps of COARSE."""
 SIGNIFICANCE = 0.01
 """Largest p-value that is reported as an artifact."""
-LEAST_BLOCKS = 6
-"""With fewer blocks of views than this, standard errors mean nothing and nothing is reported."""
+LEAST_VIEWS = 6
+"""With fewer views than this, standard errors mean nothing and nothing is reported."""
 LOW_DEVIATION = 0.2
 """Deviation relative to the capture's (its 75th percentile) below which a pixel can be behind an opaque artifact."""
 HALF_A_GREY_LEVEL = 0.5 / 255
-"""Deviations below this are low in any capture."""
+"""Deviations below this are low in any capture, and tell of no displacement."""
 OPAQUE_SHARE = 0.25
 """Share of the artifact's area that has to be opaque for that verdict."""
 NEAR = 16
@@ -49,6 +58,18 @@ NEAR = 16
 EDGE_SUPPORT = 0.5
 """Share of an area's outline that has to be static edges: a plain artifact has them all around, a plain sky has not."""
 _AROUND = np.ones((3, 3), np.uint8)
+
+
+@dataclass(frozen=True)
+class StaticArea:
+    """Where an artifact would be, whatever the verdict, and of which kind: what an overlay starts from."""
+
+    inside: Tensor
+    """[H, W] bool: static edges, and plain areas among them."""
+    near: Tensor
+    """[H, W] bool: that, and all within NEAR working pixels of a static edge."""
+    adds_light: bool
+    """The artifact shines and hides nothing (`formation.adds_light`)."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +91,14 @@ class Detection:
     null_shares: tuple[float, float]
     """The same, mean over the shifted captures."""
     evidence: Tensor
-    """[h, w] at the working resolution."""
-    mask: Tensor
-    """[H, W] bool: True where the artifact is (empty for verdict none)."""
+    """[h, w] at the working resolution; 0 where the edges move."""
+    area: StaticArea
+    """Where the artifact is; nowhere for verdict none."""
+
+    @property
+    def mask(self) -> Tensor:
+        """[H, W] bool: True where the artifact is."""
+        return self.area.inside
 
 
 def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> Detection:
@@ -84,59 +110,45 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
         seed: of the shifts; global random state is neither used nor changed.
     """
     views = int(statistics.views.max())
-    moments = _moments(statistics)
-    blocks = len(moments[0])
-    fields = [_evidence(at_scale.sum(dim=0), blocks) for at_scale in moments]
-    shares = _shares(fields)
-    nothing = torch.zeros(statistics.size, dtype=torch.bool)
-    if blocks < LEAST_BLOCKS:
-        return Detection("none", 0.0, 1.0, (0.0, 1.0), views, shares, (0.0, 0.0), fields[0], nothing)
-    null = list(_null_shares(moments, draws, np.random.default_rng(seed)))
+    moments, still = _look(statistics)
+    fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
+    shares, evidence = _shares(fields, still), fields[0] * still[0]
+    nowhere = _nowhere(statistics)
+    if views < LEAST_VIEWS:
+        return Detection("none", 0.0, 1.0, (0.0, 1.0), views, shares, (0.0, 0.0), evidence, nowhere)
+    null = list(_null_shares(moments, still, draws, np.random.default_rng(seed)))
     reached = sum(_strength(draw) >= _strength(shares) for draw in null)
     p_value = (1 + reached) / (1 + draws)
     fine, coarse = (float(np.mean(scale)) for scale in zip(*null, strict=True))
     excess = shares[0] - fine, shares[1] - coarse
     interval = _interval(reached, draws)
     if p_value > SIGNIFICANCE or _strength(excess) < 1:
-        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), fields[0], nothing)
-    mask, opaque_share = _area(statistics, fields)
-    coverage = float(mask.float().mean())
+        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere)
+    area, opaque_share = _area(statistics, _edges(fields, still))
+    coverage = float(area.inside.float().mean())
     verdict = "opaque" if opaque_share >= OPAQUE_SHARE * coverage else "faint"
-    return Detection(verdict, coverage, p_value, interval, views, shares, (fine, coarse), fields[0], mask)
-
-
-@dataclass(frozen=True)
-class StaticArea:
-    """Where an artifact would be, whatever the verdict, and of which kind: what an overlay starts from."""
-
-    inside: Tensor
-    """[H, W] bool: static edges, and plain areas among them."""
-    near: Tensor
-    """[H, W] bool: that, and all within NEAR working pixels of a static edge."""
-    adds_light: bool
-    """The artifact shines and hides nothing (`formation.adds_light`)."""
+    return Detection(verdict, coverage, p_value, interval, views, shares, (fine, coarse), evidence, area)
 
 
 def static_area(statistics: ImageStatistics) -> StaticArea:
     """The area of static edges; nothing where there are too few to report, everything where there are too few views."""
-    moments = _moments(statistics)
-    fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
-    if len(moments[0]) < LEAST_BLOCKS:
+    if int(statistics.views.max()) < LEAST_VIEWS:
         everything = torch.ones(statistics.size, dtype=torch.bool)
         return StaticArea(everything, everything, False)
-    if _strength(_shares(fields)) < 1:
-        nothing = torch.zeros(statistics.size, dtype=torch.bool)
-        return StaticArea(nothing, nothing, False)
-    inside, _ = _area(statistics, fields)
-    edges = _edges(fields)
-    distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    near = inside | torch.from_numpy(_at_full_size(distance <= NEAR, statistics))
-    mean, deviation = _at_working_size(statistics.mean(), statistics), _deviation(statistics)
-    return StaticArea(inside, near, adds_light(mean.mean(axis=0), deviation, (edges > 0) & ~_low(deviation)))
+    moments, still = _look(statistics)
+    fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
+    if _strength(_shares(fields, still)) < 1:
+        return _nowhere(statistics)
+    return _area(statistics, _edges(fields, still))[0]
 
 
-def _moments(statistics: ImageStatistics) -> list[Tensor]:
-    """Of each block's brightness, gradient along x and y and squared length of both: [K, 3, h, w], fine and coarse."""
+def _nowhere(statistics: ImageStatistics) -> StaticArea:
+    nothing = torch.zeros(statistics.size, dtype=torch.bool)
+    return StaticArea(nothing, nothing, False)
+
+
+def _look(statistics: ImageStatistics) -> tuple[list[Tensor], list[Tensor]]:
+    """Moments of the blocks' gradients [K, 3, h, w], and where the scene does not move [h, w], fine and coarse."""
     means, seen = statistics.brightness.means()
     # Where a block shows nothing of a pixel, the mean of the others stands in.
     average = (means * seen).sum(dim=0) / seen.sum(dim=0).clamp_min(1)
@@ -144,11 +156,19 @@ def _moments(statistics: ImageStatistics) -> list[Tensor]:
     hidden = (~seen.any(dim=0)).float()[None, None]
     coarse = nn.functional.avg_pool2d(means[:, None], COARSE, ceil_mode=True)[:, 0]
     coarse_hidden = nn.functional.max_pool2d(hidden, COARSE, ceil_mode=True)
-    return [_moments_of(means, hidden), _moments_of(coarse, coarse_hidden)]
+    moments = [_moments(means, hidden), _moments(coarse, coarse_hidden)]
+    parameters = zip((means, coarse), moments, WINDOWS, DISPLACED_SHARES, strict=True)
+    return moments, [
+        _displaced_share(images, at_scale[:, :2].mean(dim=0), window) <= largest
+        for images, at_scale, window, largest in parameters
+    ]
 
 
-def _moments_of(images: Tensor, hidden: Tensor) -> Tensor:
-    """`_moments` at one scale: central differences, 0 at the border and beside what no view shows [1, 1, h, w]."""
+def _moments(images: Tensor, hidden: Tensor) -> Tensor:
+    """Gradient along x and y and squared length of both [K, 3, h, w] of images [K, h, w].
+
+    Central differences, 0 at the border and beside what no view shows [1, 1, h, w].
+    """
     moments = images.new_zeros(len(images), 3, *images.shape[1:])
     moments[:, 0, :, 1:-1] = (images[:, :, 2:] - images[:, :, :-2]) / 2
     moments[:, 1, 1:-1] = (images[:, 2:] - images[:, :-2]) / 2
@@ -157,8 +177,44 @@ def _moments_of(images: Tensor, hidden: Tensor) -> Tensor:
     return moments
 
 
+def _displaced_share(images: Tensor, gradient: Tensor, window: int) -> Tensor:
+    """Share of the deviations of images [K, h, w] from their mean that displacing this mean explains, [h, w] in [0, 1].
+
+    In the window around each pixel, every image has its own displacement d, fitted by least squares to deviation =
+    constant + gain x mean + d . gradient of the mean [2, h, w] (Lucas and Kanade 1981). Constant and gain are there for
+    exposure, and for soft artifacts: behind their edges the scene fades, which alone looks much like a displacement.
+    What these two explain does not count.
+    """
+    basis = torch.cat([images.mean(dim=0, keepdim=True), gradient])
+    levels = _averaged(basis, window)
+    mean_mean, mean_x, mean_y = _averaged(basis[:1] * basis, window) - levels[:1] * levels
+    gain = torch.stack([mean_x, mean_y]) / mean_mean.clamp_min(HALF_A_GREY_LEVEL**2)
+    xx, yy = _averaged(gradient.square(), window) - levels[1:].square() - gain * torch.stack([mean_x, mean_y])
+    xy = (_averaged(gradient[:1] * gradient[1:], window) - levels[1:2] * levels[2:])[0] - gain[0] * mean_y
+    # Along a straight edge no displacement can be told: 1 % more variance keeps it near 0 there.
+    ridge = 0.01 * (xx + yy).clamp_min(torch.finfo(images.dtype).eps)
+    xx, yy = xx + ridge, yy + ridge
+    determinant = (xx * yy - xy.square()).clamp_min(ridge.square())
+    explained, total = torch.zeros_like(images[0]), torch.zeros_like(images[0])
+    for deviation in (images - basis[0])[:, None]:
+        level = _averaged(deviation, window)
+        with_mean, *with_gradient = _averaged(basis * deviation, window) - levels * level
+        x, y = torch.stack(with_gradient) - gain * with_mean
+        explained += (yy * x.square() - 2 * xy * x * y + xx * y.square()) / determinant
+        total += (_averaged(deviation.square(), window) - level.square())[0]
+    return (explained / total.clamp_min(len(images) * HALF_A_GREY_LEVEL**2)).clamp(0, 1)
+
+
+def _averaged(images: Tensor, window: int) -> Tensor:
+    """Means over windows of this odd side, [n, h, w]; at the border of what lies inside."""
+    for sides in ((window, 1), (1, window)):
+        margins = sides[0] // 2, sides[1] // 2
+        images = nn.functional.avg_pool2d(images, sides, stride=1, padding=margins, count_include_pad=False)
+    return images
+
+
 def _evidence(sums: Tensor, count: int) -> Tensor:
-    """Length of the mean gradient over its standard error, [h, w].
+    """Length of the mean gradient over its standard error [h, w], of `count` moments' sums [3, h, w].
 
     The error has a floor, so that a gradient fainter than FAINTEST_GRADIENT stays below EVIDENCE_NEEDED.
     """
@@ -168,8 +224,14 @@ def _evidence(sums: Tensor, count: int) -> Tensor:
     return (length / error.add_((FAINTEST_GRADIENT / EVIDENCE_NEEDED[0]) ** 2)).sqrt_()
 
 
-def _null_shares(moments: list[Tensor], draws: int, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
-    """Shares of static edges after every block was shifted in its own random way, the same at both scales."""
+def _null_shares(
+    moments: list[Tensor], still: list[Tensor], draws: int, rng: np.random.Generator
+) -> Iterator[tuple[float, float]]:
+    """Shares of static edges after every block was shifted in its own random way, the same at both scales.
+
+    Where the scene moves is left out as in the capture itself. Found in the capture, it takes away more of its edges
+    than of a shifted one's: p-values err upwards.
+    """
     reach = LARGEST_SHIFT // COARSE
     steps = COARSE, 1
     framed = [_framed(at_scale, reach * step) for at_scale, step in zip(moments, steps, strict=True)]
@@ -182,7 +244,7 @@ def _null_shares(moments: list[Tensor], draws: int, rng: np.random.Generator) ->
             for block, (y, x) in zip(padded, ways, strict=True):
                 sums += block[:, y * step : y * step + h, x * step : x * step + w]
             fields.append(_evidence(sums, len(at_scale)))
-        yield _shares(fields)
+        yield _shares(fields, still)
 
 
 def _framed(moments: Tensor, margin: int) -> Tensor:
@@ -193,9 +255,11 @@ def _framed(moments: Tensor, margin: int) -> Tensor:
     return moments[:, :, rows][:, :, :, columns]
 
 
-def _shares(fields: list[Tensor]) -> tuple[float, float]:
+def _shares(fields: list[Tensor], still: list[Tensor]) -> tuple[float, float]:
+    """Shares of the frame that are static edges which do not move."""
     fine, coarse = (
-        float((field >= needed).float().mean()) for field, needed in zip(fields, EVIDENCE_NEEDED, strict=True)
+        float(((field >= needed) & unmoved).float().mean())
+        for field, unmoved, needed in zip(fields, still, EVIDENCE_NEEDED, strict=True)
     )
     return fine, coarse
 
@@ -211,19 +275,25 @@ def _interval(reached: int, draws: int) -> tuple[float, float]:
     return low, high
 
 
-def _area(statistics: ImageStatistics, fields: list[Tensor]) -> tuple[Tensor, float]:
-    """Static edges, widened, and the areas of low deviation among them, [H, W] bool; and the share that is opaque."""
-    edges, low = _edges(fields), _low(_deviation(statistics)).astype(np.uint8)
-    plain = _supported(low, cv2.dilate(edges, _AROUND, iterations=2))
-    mask = _at_full_size(cv2.dilate(edges, _AROUND) | plain, statistics)
-    return torch.from_numpy(mask), float((plain | (edges & low)).mean())
+def _area(statistics: ImageStatistics, edges: np.ndarray) -> tuple[StaticArea, float]:
+    """Edges [h, w], widened, and the areas of low deviation among them; and the share of the frame that is opaque."""
+    deviation = _deviation(statistics)
+    low = _low(deviation)
+    plain = _supported(low.astype(np.uint8), cv2.dilate(edges, _AROUND, iterations=2))
+    inside = torch.from_numpy(_at_full_size(cv2.dilate(edges, _AROUND) | plain, statistics))
+    distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    near = inside | torch.from_numpy(_at_full_size(distance <= NEAR, statistics))
+    mean = _at_working_size(statistics.mean(), statistics).mean(axis=0)
+    area = StaticArea(inside, near, adds_light(mean, deviation, (edges > 0) & ~low))
+    return area, float((plain | (edges & low)).mean())
 
 
-def _edges(fields: list[Tensor]) -> np.ndarray:
-    """Static edges at the working resolution, uint8 [h, w]: the coarse ones where there are too few fine ones."""
+def _edges(fields: list[Tensor], still: list[Tensor]) -> np.ndarray:
+    """The artifact's edges at the working resolution, uint8 [h, w]: coarse ones where there are too few fine ones."""
     h, w = fields[0].shape
     fine, coarse = (
-        (field >= needed).cpu().numpy().astype(np.uint8) for field, needed in zip(fields, EVIDENCE_NEEDED, strict=True)
+        _settled((field >= needed).cpu().numpy().astype(np.uint8), unmoved.cpu().numpy())
+        for field, unmoved, needed in zip(fields, still, EVIDENCE_NEEDED, strict=True)
     )
     return fine if fine.mean() >= LEAST_SHARES[0] else np.kron(coarse, np.ones((COARSE, COARSE), np.uint8))[:h, :w]
 
@@ -251,6 +321,14 @@ def _at_full_size(mask: np.ndarray, statistics: ImageStatistics) -> np.ndarray:
     reduction = statistics.brightness.reduction
     enlarged = np.kron(mask.astype(np.uint8), np.ones((reduction, reduction), np.uint8))
     return np.pad(enlarged, ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1])), mode="edge") > 0
+
+
+def _settled(edges: np.ndarray, still: np.ndarray) -> np.ndarray:
+    """Those connected edges of which a share of STILL_SHARE does not move: uint8 [h, w]."""
+    count, labels = cv2.connectedComponents(cv2.dilate(edges, _AROUND))
+    total = np.bincount(labels[edges > 0], minlength=count)
+    unmoved = np.bincount(labels[(edges > 0) & still], minlength=count)
+    return edges * (unmoved >= STILL_SHARE * total)[np.asarray(labels, np.int32)]
 
 
 def _supported(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:

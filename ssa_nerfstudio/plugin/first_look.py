@@ -11,7 +11,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 
 from ssa_nerfstudio.errors import refuse
-from ssa_nerfstudio.overlay.detection import LEAST_BLOCKS, Detection, detect, static_area
+from ssa_nerfstudio.overlay.detection import LEAST_VIEWS, Detection, detect, static_area
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
@@ -86,7 +86,7 @@ def _found(detection: Detection, name: str) -> bool:
             f"{detection.coverage:.1%} of the frame): it is learned. (--pipeline.model.overlay off: it is not.)"
         )
         return True
-    reason = "too few to tell" if detection.views < LEAST_BLOCKS else f"p = {detection.p_value:.2g}"
+    reason = "too few to tell" if detection.views < LEAST_VIEWS else f"p = {detection.p_value:.2g}"
     CONSOLE.print(
         f"{name[0].upper()}{name[1:]} show no static artifact ({detection.views} views, {reason}): training without an "
         "overlay. (--pipeline.model.overlay on: with one.)"

@@ -7,9 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from ssa_nerfstudio.benchmark.detection import detections, stretches
 from ssa_nerfstudio.benchmark.real_artifact import undistorted_mask
 from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.simulation.dataset import Dataset
 
 pytestmark = pytest.mark.slow
 
@@ -35,3 +37,11 @@ def test_a_real_bonnet_is_found_and_the_constant_sky_stays_out_of_the_overlay(ca
     assert torch.isfinite(matte).all()
     assert matte[: len(matte) // 3].mean() < 0.15
     assert matte[bonnet].mean() > 0.3
+
+
+def test_a_short_clip_of_a_walk_straight_ahead_is_clean_and_a_watermark_in_it_is_found(captures):
+    """The scenery far ahead hardly moves; docs/detect.md has all lengths, captures and effects."""
+    walk = Dataset.read(captures / "gopro_walk", eval_interval=8)
+    clips = [*stretches(len(walk.views), 8), *stretches(len(walk.views), 24)]
+    assert {found.verdict for found in detections(walk, None, 0, clips)} == {"none"}
+    assert "none" not in {found.verdict for found in detections(walk, "watermark", 0, clips)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -116,6 +117,70 @@ def test_what_recurs_without_staying_in_place_is_no_artifact():
         y, x = rng.integers(20, 40), rng.integers(30, 60)
         photo[y : y + 30, x : x + 30] //= 3
     assert detect(statistics_of(photos)).verdict == "none"
+
+
+def distant(views: int, seed: int = 0) -> list[np.ndarray]:
+    """Photos of soft clouds from a hand that trembles by up to two pixels, uint8."""
+    rng = np.random.default_rng(seed)
+    clouds = cv2.GaussianBlur(rng.random((HEIGHT + 8, WIDTH + 8, 3)), (0, 0), 4)
+    clouds = (clouds - clouds.min()) / np.ptp(clouds)
+    photos = []
+    for x, y in rng.uniform(2, 6, (views, 2)):
+        place = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+        moved = cv2.warpAffine(clouds, place, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        photos.append((255 * moved + rng.normal(0, 1, moved.shape)).round().clip(0, 255).astype(np.uint8))
+    return photos
+
+
+@pytest.mark.parametrize("views", [8, 12, 40])
+def test_what_trembles_together_is_no_artifact_though_its_edges_hardly_move(views, monkeypatch):
+    statistics = statistics_of(distant(views))
+    found = detect(statistics)
+    assert found.verdict == "none"
+    assert max(found.shares) < 0.003
+    assert not static_area(statistics).near.any()
+    monkeypatch.setattr(detection, "DISPLACED_SHARES", (1.0, 1.0))
+    assert detect(statistics).verdict != "none", "without a look at displacements it would be one"
+
+
+@pytest.mark.parametrize("views", [8, 12, 40])
+def test_in_front_of_what_trembles_an_artifact_is_found(views):
+    photos = distant(views)
+    panel = texture(np.random.default_rng(1), 128)[: HEIGHT - 70] * 255
+    for photo in photos:
+        photo[70:] = panel
+    found = detect(statistics_of(photos))
+    assert found.verdict == "opaque"
+    assert found.mask[72:].float().mean() > 0.9
+
+
+def test_a_displaced_picture_is_told_from_one_that_something_else_passes_behind():
+    """Moved clouds deviate by displacement alone; of noise, chance explains two of 21 x 21 pixels; exposure is none."""
+    rng = np.random.default_rng(0)
+    clouds = cv2.GaussianBlur(rng.random((HEIGHT, WIDTH)), (0, 0), 5)
+    clouds = torch.from_numpy((clouds - clouds.min()) / np.ptp(clouds)).float()
+    down, right = torch.gradient(clouds)
+    along, across = torch.from_numpy(rng.normal(size=(2, 12, 1, 1))).float()
+    gains = torch.linspace(-0.2, 0.2, 12)[:, None, None]
+    noise = torch.from_numpy(rng.normal(0, 0.1, (12, HEIGHT, WIDTH))).float()
+    gradient = torch.stack([right, down])
+    for deviations, low, high in (
+        (along * right + across * down, 0.9, 1.0),
+        (noise, 0.0, 0.02),
+        (gains * clouds, 0.0, 0.02),
+    ):
+        share = detection._displaced_share(clouds + deviations - deviations.mean(dim=0), gradient, 21)
+        assert low <= float(share[12:-12, 12:-12].median()) <= high
+
+
+def test_edges_that_hang_together_stay_if_a_tenth_of_them_is_still():
+    edges = np.zeros((9, 40), np.uint8)
+    edges[2, 2:22] = edges[6, 2:22] = 1
+    still = np.zeros((9, 40), bool)
+    still[2, 20:22] = still[6, 21] = True
+    settled = detection._settled(edges, still)
+    assert (settled[2] == edges[2]).all()
+    assert not settled[6].any()
 
 
 def test_vignetting_alone_is_smooth_and_raises_no_alarm():
