@@ -34,11 +34,12 @@ def learned_overlays(
         if config.overlay == "auto" or config.overlay_start != "constant":
             name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
             statistics = _look_at([photo for photo, at in zip(photos, groups, strict=True) if at == group], name)
-            if config.overlay == "auto" and not _found(detect(statistics), name):
+            detection = detect(statistics) if config.overlay == "auto" else None
+            if detection is not None and not _found(detection, name):
                 overlays.append(None)
                 continue
             if config.overlay_start == "detected":
-                area = static_area(statistics)
+                area = static_area(statistics) if detection is None else detection.area
                 light = area.adds_light if config.overlay_light == "auto" else config.overlay_light == "on"
                 overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, light)
                 overlay.start_from(statistics, area)

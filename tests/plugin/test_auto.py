@@ -64,8 +64,14 @@ def test_a_clean_scene_pays_for_nothing(clean_scene, tmp_path):
     assert not {"composite", "overlay_rgb", "overlay_alpha"} & drawn.keys()
 
 
-def test_a_dashboard_is_learned(tiny_scene, tmp_path):
+def test_a_dashboard_is_learned_where_it_was_found(tiny_scene, tmp_path, monkeypatch):
+    """The same losses as with "on", and the area comes from the one detection."""
     on, _ = losses(tiny_scene, tmp_path, "on", steps=5)
+
+    def again(*_):
+        raise AssertionError("looked for the area a second time")
+
+    monkeypatch.setattr(first_look, "static_area", again)
     auto, trainer = losses(tiny_scene, tmp_path, "auto", steps=5)
     assert auto == on
     assert "overlay" in trainer.optimizers.optimizers
