@@ -59,13 +59,14 @@ class AdaptiveDensityControl(DefaultStrategy):
         # Gradients with respect to coordinates that run over [-1, 1] across the image.
         half = 0.5 * info["n_cameras"]
         norms = torch.hypot(gradients[..., 0] * (half * info["width"]), gradients[..., 1] * (half * info["height"]))
-        visible = info["radii"] > 0  # [C, N]
-        if self.guarded and info.get("skipped") is not None:
-            visible = visible & (info["skipped"] == 0)
+        radii = info["radii"]  # [C, N]
+        if self.guarded and info.get("taken") is not None:
+            radii = radii * info["taken"]
+        visible = radii > 0
         state["grad2d"] += torch.where(visible, norms, torch.zeros_like(norms)).sum(dim=0)
         state["count"] += visible.sum(dim=0)
         if self.refine_scale2d_stop_iter > 0:
-            radii = (info["radii"] * visible).amax(dim=0) / float(max(info["width"], info["height"]))
+            radii = radii.amax(dim=0) / float(max(info["width"], info["height"]))
             torch.maximum(state["radii"], radii, out=state["radii"])
 
     @torch.no_grad()
@@ -106,8 +107,8 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     ) -> None:
         """Relocate, add and perturb; the noise follows the current learning rate of the means."""
         lr = optimizers["means"].param_groups[0]["lr"]
-        if self.guarded and info.get("skipped") is not None:
-            lr = lr * (1.0 - info["skipped"])
+        if self.guarded and info.get("taken") is not None:
+            lr = lr * info["taken"]
         super().step_post_backward(params, optimizers, state, step, info, lr=lr)
 
     @torch.no_grad()

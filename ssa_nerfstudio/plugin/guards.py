@@ -7,7 +7,7 @@ configuration takes all of it away.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -16,16 +16,21 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from ssa_nerfstudio.errors import give_up, warn
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 READ_EVERY = 100
 """Steps between two looks of the host at what the device noted."""
+RANGE_EVERY = 10
+"""Steps between two moments at which parameters are brought back into their ranges; they leave by at most so many
+learning rates."""
 SCALE_RANGE = (1e-8, 1e4)
 """Sizes of Gaussians in world units. The smaller is a thousandth of a pixel at the near plane for a focal length of
 1000 pixels; with the larger, the determinant of a projected covariance still fits into float32."""
 START_DISTANCE = NEAR_PLANE
 """A start point nearer to a camera than this (world units) is inside it: that camera can never draw it."""
 
+THE_LOSS = "the loss"
 LONELY_SIZE = 0.01
 """Size (world units) of start points that all lie in one place."""
 
@@ -46,33 +51,52 @@ class StepGuard:
         self.limit = limit
         self.skipped: Tensor | None = None
         """1 where the current step is skipped, else 0: one float tensor on the device; None before the first step."""
-        self._watched: list[tuple[str, Tensor]] = []
-        self._norms: Tensor
-        self._noted = 0
+        self.taken: Tensor | None = None
+        """1 - skipped."""
+        self._optimizers: Mapping[str, torch.optim.Optimizer] = {}
+        self._skips: list[Tensor] = []
+        self._noted: list[tuple[list[str], Sequence[Tensor]]] = []
         self._row, self._row_began, self._culprits = 0, 0, ""
 
-    def judge(self, loss: Tensor, optimizers: dict[str, torch.optim.Optimizer]) -> None:
-        """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device."""
-        found = list(_parameters(optimizers))
-        if self.skipped is None:
-            self.skipped = loss.new_zeros((), dtype=torch.float32)
-        if len(self._watched) != len(found):
-            self._norms, self._noted = self.skipped.new_zeros(READ_EVERY, 1 + len(found)), 0
-        self._watched = found
-        values = [loss.detach(), *(self.skipped.new_zeros(()) if p.grad is None else p.grad.detach() for _, p in found)]
-        each = torch._foreach_norm(values)  # pyright: ignore[reportPrivateImportUsage]
-        norms = torch.stack([norm.float() for norm in each])
-        self._norms[self._noted % READ_EVERY] = norms
-        self._noted += 1
-        self.skipped.copy_(~(norms.sum() < math.inf))
+    def judge(self, losses: Sequence[Tensor], optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+        """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device.
 
-    def before_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
-        """Hook that makes an optimiser skip: fused ones are told on the device, for others the host has to ask."""
+        Args:
+            losses: the terms of the loss, scalars.
+            optimizers: by name.
+        """
+        if len(self._noted) == len(self._skips):
+            self._skips += losses[0].new_zeros(READ_EVERY, dtype=torch.float32).unbind()
+            self._one = losses[0].new_ones((), dtype=torch.float32)
+        self._optimizers = optimizers
+        names, values = [THE_LOSS] * len(losses), list(losses)
+        for name, parameter in _parameters(optimizers):
+            if parameter.grad is not None:
+                names.append(name)
+                values.append(parameter.grad)
+        norms = torch._foreach_norm(values)  # pyright: ignore[reportPrivateImportUsage]
+        self.skipped = self._skips[len(self._noted)]
+        # Sets `skipped` to 1 where a norm is not finite; multiplies the norms by one.
+        search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
+        search(norms, self.skipped, self._one)
+        self.taken = 1 - self.skipped
+        self._noted.append((names, norms))
+
+    def watch(self, optimizer: torch.optim.Optimizer) -> None:
+        """Let an optimiser take no step that was judged to be skipped."""
+        optimizer.register_step_pre_hook(self._before_step)
+        if not isinstance(optimizer, FusedAdam):
+            optimizer.register_step_post_hook(_forget)
+
+    def _before_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
+        """Fused optimisers are told on the device, for others the host has to ask."""
         if self.skipped is None:
             return
-        if getattr(optimizer, "_step_supports_amp_scaling", False):
+        if isinstance(optimizer, FusedAdam):
+            optimizer.refused, optimizer.taken = self.skipped, self.taken
+        elif getattr(optimizer, "_step_supports_amp_scaling", False):
             scalers = getattr(optimizer, "found_inf", None)  # a GradScaler has found something of its own
-            if scalers is None or scalers is self.skipped:
+            if scalers is None:
                 optimizer.found_inf = self.skipped  # pyright: ignore[reportAttributeAccessIssue]
             else:
                 optimizer.found_inf = torch.maximum(self.skipped, scalers)  # pyright: ignore[reportAttributeAccessIssue]
@@ -87,17 +111,16 @@ class StepGuard:
         Raises:
             TrainingFailed: where `limit` steps in a row, up to any of them, were skipped.
         """
-        rows = self._norms[: self._noted].tolist() if self._noted else []
-        self._noted = 0
-        skipped = 0
-        for at, row in enumerate(rows, start=step + 1 - len(rows)):
-            broken = [k for k, norm in enumerate(row) if not math.isfinite(norm)]
-            if not broken:
+        noted, self._noted = self._noted, []
+        skips = torch.stack(self._skips[: len(noted)]).tolist() if noted else []
+        self._skips = []
+        skipped = int(sum(skips))
+        for at, (skip, (names, norms)) in enumerate(zip(skips, noted, strict=True), start=step + 1 - len(noted)):
+            if not skip:
                 self._row = 0
                 continue
-            skipped += 1
             if self._row == 0:
-                self._row_began, self._culprits = at, self._described(broken)
+                self._row_began, self._culprits = at, self._described(names, norms)
             self._row += 1
             if self._row >= self.limit:
                 raise give_up(
@@ -106,18 +129,18 @@ class StepGuard:
                     "with lower learning rates"
                 )
         if skipped:
-            warn(f"{skipped} of the {len(rows)} steps up to {step} were skipped: {self._culprits} not finite")
+            warn(f"{skipped} of the {len(noted)} steps up to {step} were skipped: {self._culprits} not finite")
         return skipped
 
-    def _described(self, broken: list[int]) -> str:
+    def _described(self, names: list[str], norms: Sequence[Tensor]) -> str:
         """What was not finite: "the loss", "the gradient of scales", and the parameters that are so themselves."""
-        names = [name for name, _ in self._watched]
-        values = [name for name, parameter in self._watched if not torch.isfinite(parameter).all()]
+        values = [name for name, p in _parameters(self._optimizers) if not torch.isfinite(p).all()]
         if values:
             return f"{', '.join(values)} (the values themselves) and what follows from them were"
-        gradients = [names[k - 1] for k in broken if k]
-        parts = ["the loss"] * (broken[0] == 0)
-        if len(gradients) == len(names):
+        broken = [name for name, norm in zip(names, norms, strict=True) if not math.isfinite(norm)]
+        gradients = [name for name in broken if name != THE_LOSS]
+        parts = [THE_LOSS] * (THE_LOSS in broken)
+        if len(gradients) == len(names) - names.count(THE_LOSS):
             parts.append("every gradient")
         elif gradients:
             parts.append(f"the gradient of {', '.join(gradients)}")
@@ -132,20 +155,25 @@ class GuardedOptimizers(Optimizers):
         config: dict[str, Any],
         param_groups: dict[str, list[Parameter]],
         guard: StepGuard,
-        loss: Callable[[], Tensor],
+        losses: Callable[[], Sequence[Tensor]],
     ) -> None:
         super().__init__(config, param_groups)
-        self.guard, self._loss = guard, loss
+        self.guard, self._losses = guard, losses
         for optimizer in self.optimizers.values():
-            optimizer.register_step_pre_hook(guard.before_step)
+            guard.watch(optimizer)
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Judge the step, then step the groups."""
-        self.guard.judge(self._loss(), {name: self.optimizers[name] for name in param_groups})
+        self.guard.judge(self._losses(), {name: self.optimizers[name] for name in param_groups})
         super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
-def _parameters(optimizers: dict[str, torch.optim.Optimizer]) -> Iterator[tuple[str, Tensor]]:
+def _forget(optimizer: torch.optim.Optimizer, *_: Any) -> None:
+    """What one step found is nothing to the next."""
+    optimizer.found_inf = None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _parameters(optimizers: Mapping[str, torch.optim.Optimizer]) -> Iterator[tuple[str, Tensor]]:
     """Every parameter with its name. Not from a list of old: densification puts new ones into the optimisers."""
     for name, optimizer in optimizers.items():
         parameters = [p for group in optimizer.param_groups for p in group["params"]]

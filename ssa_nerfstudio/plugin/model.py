@@ -173,7 +173,7 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def step_post_backward(self, step: int) -> None:
         """After the optimisers' step: bring parameters back into their range, then densify."""
-        if self.config.guards:
+        if self.config.guards and step % guards.RANGE_EVERY == 0:
             guards.keep_scales_in_range(self.scales)
             for overlay in self.artifacts.learned():
                 overlay.keep_in_range()

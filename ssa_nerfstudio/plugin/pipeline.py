@@ -39,7 +39,8 @@ class SSAPipeline(VanillaPipeline):
     config: SSAPipelineConfig
     datamanager: SSADatamanager
     model: SSASplatfactoModel
-    loss: torch.Tensor
+    losses: tuple[torch.Tensor, ...]
+    """The terms of the last loss, cut off from the graph."""
 
     def __init__(
         self,
@@ -65,9 +66,9 @@ class SSAPipeline(VanillaPipeline):
             self._set_overlays()
 
     def get_train_loss_dict(self, step: int):
-        """Upstream's, with the whole loss kept for the guard that reads it before the optimisers step."""
+        """Upstream's, with the loss kept for the guard that reads it before the optimisers step."""
         outputs, losses, metrics = super().get_train_loss_dict(step)
-        self.loss = torch.stack([loss.detach() for loss in losses.values()]).sum()
+        self.losses = tuple(loss.detach() for loss in losses.values())
         return outputs, losses, metrics
 
     def _set_overlays(self) -> None:

@@ -9,7 +9,7 @@ from typing import Literal
 
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import AdamOptimizerConfig, Optimizers
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
@@ -20,17 +20,6 @@ from ssa_nerfstudio.plugin.guards import READ_EVERY, GuardedOptimizers, StepGuar
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.schedules import scaled
-
-
-@dataclass
-class FusedAdamConfig(AdamOptimizerConfig):
-    """Adam that updates a parameter group in one kernel. eps is 1e-15: gradients here are means over pixels, about
-    1 / (H W), and torch's 1e-8 would freeze whatever a single pixel drives."""
-
-    eps: float = 1e-15
-    """Added to the root of the second moment."""
-    fused: bool = True
-    """One kernel a group instead of a dozen."""
 
 
 @dataclass
@@ -82,7 +71,7 @@ class SSATrainer(Trainer):
             return super().setup_optimizers()
         self.guard = StepGuard(self.config.pipeline.model.max_skipped_steps)
         groups = self.pipeline.get_param_groups()
-        return GuardedOptimizers(self.config.optimizers.copy(), groups, self.guard, lambda: self.pipeline.loss)
+        return GuardedOptimizers(self.config.optimizers.copy(), groups, self.guard, lambda: self.pipeline.losses)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as upstream does, and say at the end of the training what became of the artifact.
@@ -168,7 +157,7 @@ class SSATrainer(Trainer):
         """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""
         loss, losses, metrics = super().train_iteration(step)
         if self.guard is not None:
-            self.pipeline.model.info["skipped"] = self.guard.skipped
+            self.pipeline.model.info["taken"] = self.guard.taken
             if (step + 1) % READ_EVERY == 0:
                 self.guard.look(step)
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics

@@ -62,7 +62,8 @@ def test_a_training_whose_gaussians_are_not_finite_has_diverged(tiny_scene, tmp_
 
 def _overlay(layers: Layers) -> ScreenSpaceOverlay:
     """An overlay that is the artifact, as far as one matte for all channels can be."""
-    overlay = ScreenSpaceOverlay(*layers.matte.shape)
+    height, width = layers.matte.shape
+    overlay = ScreenSpaceOverlay(height, width)
     alpha = torch.from_numpy(1 - layers.transmittance[..., :1])
     colour = torch.from_numpy(layers.addition) / alpha.clamp_min(1e-3)
     with torch.no_grad():

@@ -20,7 +20,7 @@ def scene(rng: np.random.Generator, views: int = VIEWS) -> np.ndarray:
     """Views [V, H, W, 3] in [0, 0.7] that share nothing, with structure of all sizes."""
     layers = [cv2.resize(rng.random((views, 3, size, size)).transpose(2, 3, 0, 1).reshape(size, size, -1)[..., :500],
                          (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC) for size in (4, 16, 64)]  # fmt: skip
-    mixed = sum(layers) / len(layers)
+    mixed = np.mean(layers, axis=0)
     return mixed.reshape(HEIGHT, WIDTH, views, 3).transpose(2, 0, 1, 3).clip(0, 1) * 0.7
 
 

@@ -15,7 +15,8 @@ import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies tha
 from ssa_nerfstudio.benchmark.run import configure
 from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
-from ssa_nerfstudio.plugin.guards import SCALE_RANGE, StepGuard, first_not_finite, keep_scales_in_range
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam
+from ssa_nerfstudio.plugin.guards import RANGE_EVERY, SCALE_RANGE, StepGuard, first_not_finite, keep_scales_in_range
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 OVERLAYS = pytest.mark.parametrize("overlay", ["on", "off"])
@@ -46,7 +47,7 @@ def spoil(trainer: SSATrainer, steps: set[int] | range, what: str = "scales", va
         if step in steps and what == "loss":
             # A loss that is not finite without a gradient that is not: only the loss tells.
             losses["broken"] = torch.full((), value)
-            pipeline.loss = pipeline.loss + value
+            pipeline.losses = (*pipeline.losses, torch.tensor(value))
         elif step in steps:
             parameter = pipeline.get_param_groups()[what][0]
             poison = torch.zeros_like(parameter)
@@ -130,15 +131,15 @@ def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_gua
 
 def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_its_element():
     parameter = torch.nn.Parameter(torch.zeros(3))
-    optimizer = torch.optim.Adam([parameter], lr=0.1, fused=True, eps=1e-15)
+    optimizer = FusedAdam([parameter], lr=0.1, eps=1e-15)
     frozen = torch.nn.Parameter(torch.zeros(3))
     plain = torch.optim.Adam([frozen], lr=0.1, fused=True, eps=1e-15)
     guard = StepGuard(limit=10)
-    optimizer.register_step_pre_hook(guard.before_step)
+    guard.watch(optimizer)
     for largest in (1e22, 1.0, 1.0):
         gradient = torch.tensor([largest, 1.0, 1.0])
         parameter.grad, frozen.grad = gradient.clone(), gradient.clone()
-        guard.judge(torch.tensor(1.0), {"p": optimizer})
+        guard.judge([torch.tensor(1.0)], {"p": optimizer})
         optimizer.step()
         plain.step()
     torch.testing.assert_close(parameter.detach(), torch.full((3,), -0.2))
@@ -146,17 +147,19 @@ def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_it
     assert torch.isinf(plain.state[frozen]["exp_avg_sq"][0])
 
 
-@pytest.mark.parametrize("kind", ["fused", "foreach", "single", "sgd"])
+@pytest.mark.parametrize("kind", ["ours", "fused", "foreach", "single", "sgd"])
 @pytest.mark.parametrize("scaler", [False, True])
 def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
     parameter = torch.nn.Parameter(torch.ones(4))
     if kind == "sgd":
         optimizer: torch.optim.Optimizer = torch.optim.SGD([parameter], lr=0.1, momentum=0.9)
+    elif kind == "ours":
+        optimizer = FusedAdam([parameter], lr=0.1)
     else:
         fused, foreach = kind == "fused", kind == "foreach"
         optimizer = torch.optim.Adam([parameter], lr=0.1, fused=fused, foreach=None if fused else foreach)
     guard = StepGuard(limit=10)
-    optimizer.register_step_pre_hook(guard.before_step)
+    guard.watch(optimizer)
     grad_scaler = torch.amp.GradScaler("cpu", enabled=scaler, init_scale=4.0, growth_interval=1000)
     seen = []
     for value in (1.0, math.nan, 1.0):
@@ -164,7 +167,7 @@ def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
         # What breaks may belong to another optimiser: this one's gradient is fine and it must skip all the same.
         other = torch.nn.Parameter(torch.zeros(1))
         other.grad, parameter.grad = parameter.grad[:1].clone(), torch.ones(4) * (4.0 if scaler else 1.0)
-        guard.judge(torch.tensor(1.0), {"p": optimizer, "other": torch.optim.SGD([other], lr=0.1)})
+        guard.judge([torch.tensor(1.0)], {"p": optimizer, "other": torch.optim.SGD([other], lr=0.1)})
         grad_scaler.scale(torch.ones(()))  # a scaler makes its state on first use
         grad_scaler.step(optimizer)
         grad_scaler.update()
@@ -225,7 +228,7 @@ def test_a_row_of_skipped_steps_is_counted_across_looks():
     optimizers: dict[str, torch.optim.Optimizer] = {"p": torch.optim.SGD([parameter], lr=1.0)}
     for step in range(200):
         parameter.grad = torch.full((2,), math.inf if 85 <= step < 115 else 1.0)
-        guard.judge(torch.tensor(1.0), optimizers)
+        guard.judge([torch.tensor(1.0)], optimizers)
         if step == 99:
             assert guard.look(step) == 15
     with pytest.raises(TrainingFailed, match="from step 85 on"):
@@ -238,7 +241,8 @@ def test_the_culprit_is_the_parameter_whose_value_broke():
     broken.data[0] = math.nan
     for parameter in (broken, fine):
         parameter.grad = torch.full((2,), math.nan)
-    guard.judge(torch.tensor(math.nan), {"b": torch.optim.SGD([broken], lr=1.0), "f": torch.optim.SGD([fine], lr=1.0)})
+    optimizers = {name: torch.optim.SGD([p], lr=1.0) for name, p in (("b", broken), ("f", fine))}
+    guard.judge([torch.tensor(math.nan)], optimizers)
     with pytest.raises(TrainingFailed, match=r"b \(the values themselves\)"):
         guard.look(0)
 
@@ -246,7 +250,7 @@ def test_the_culprit_is_the_parameter_whose_value_broke():
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
 def test_log_scales_stay_in_range(tiny_scene, tmp_path, overlay, guards):
-    trainer = make(tiny_scene, tmp_path, steps=2, overlay=overlay, guards=guards)
+    trainer = make(tiny_scene, tmp_path, steps=RANGE_EVERY + 1, overlay=overlay, guards=guards)
     with torch.no_grad():
         trainer.pipeline.model.scales[0], trainer.pipeline.model.scales[1] = -40.0, 30.0
     trainer.train()
@@ -309,7 +313,7 @@ def test_a_matte_at_either_end_comes_back_and_without_the_range_it_does_not(sign
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
 def test_the_cap_holds_in_a_training_and_a_given_overlay_has_none(tiny_scene, tmp_path, overlay, guards):
-    trainer = make(tiny_scene, tmp_path, steps=2, overlay=overlay, guards=guards)
+    trainer = make(tiny_scene, tmp_path, steps=RANGE_EVERY + 1, overlay=overlay, guards=guards)
     learned = trainer.pipeline.model.artifacts.learned()
     with torch.no_grad():
         for part in learned:
@@ -367,9 +371,9 @@ def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys):
 def test_the_guard_never_waits_for_the_device_between_two_looks():
     """Torch's own detector of host synchronisation needs CUDA; here every way of asking a tensor is forbidden."""
     parameter = torch.nn.Parameter(torch.ones(3))
-    optimizer = torch.optim.Adam([parameter], lr=0.1, fused=True)
+    optimizer = FusedAdam([parameter], lr=0.1)
     guard = StepGuard(limit=5)
-    optimizer.register_step_pre_hook(guard.before_step)
+    guard.watch(optimizer)
 
     def asked(*_):
         raise AssertionError("the host asked a tensor for its value")
@@ -379,6 +383,6 @@ def test_the_guard_never_waits_for_the_device_between_two_looks():
             patch.setattr(Tensor, name, asked)
         for value in (1.0, math.nan, 1.0):
             parameter.grad = torch.full((3,), value)
-            guard.judge(torch.ones(()), {"p": optimizer})
+            guard.judge([torch.ones(())], {"p": optimizer})
             optimizer.step()
     assert guard.look(2) == 1

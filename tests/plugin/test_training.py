@@ -17,6 +17,7 @@ from PIL import Image
 from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
 from ssa_nerfstudio.effects.dashboard import Dashboard
 from ssa_nerfstudio.overlay.statistics import accumulate
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.schedules import scaled
 
 
@@ -198,8 +199,10 @@ def test_light_in_front_of_the_photos_is_recognised_learned_and_reloaded(broken_
     _, pipeline, config = run(broken_scene, tmp_path, 4, overlay="on")
     assert pipeline.model.artifacts.learned()[0].adds_light
     _, reloaded, _, _ = eval_setup(config, test_mode="inference")
-    assert reloaded.model.artifacts.learned()[0].adds_light
-    assert reloaded.model.artifacts.exceed_white
+    artifacts = reloaded.model.artifacts
+    assert isinstance(artifacts, Artifacts)
+    assert artifacts.learned()[0].adds_light
+    assert artifacts.exceed_white
 
 
 def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path):

@@ -50,7 +50,7 @@ def train(data: Path, steps: int = 25, method: str = "ssa-splatfacto", rates: fl
         if entry["scheduler"] is not None and entry["scheduler"].lr_final is not None:
             entry["scheduler"].lr_final *= rates
     outcome, pipeline, _ = train_and_evaluate(config)
-    assert torch.isfinite(pipeline.loss)
+    assert all(torch.isfinite(loss) for loss in pipeline.losses)
     for name, parameter in pipeline.model.named_parameters():
         assert torch.isfinite(parameter).all(), name
     finite = {name: value for name, value in outcome.metrics.items() if not name.endswith("_std")}
