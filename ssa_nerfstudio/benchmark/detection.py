@@ -62,10 +62,10 @@ def detections(dataset: Dataset, effect: str | None, seed: int, chosen: list[set
 
 
 def rates(
-    dataset: Dataset, repeats: int, clock: Callable[[], float] = time.perf_counter
+    dataset: Dataset, repeats: int, clock: Callable[[], float] = time.process_time
 ) -> tuple[float, float, float, float]:
-    """Medians over interleaved turns, seconds for all photos: decode and undistort; statistics and blocks; the blocks
-    of brightness alone; the test at the end."""
+    """Medians over interleaved turns, seconds of CPU time for all photos: decode and undistort; statistics and blocks;
+    the blocks of brightness alone; the test at the end."""
     turns = []
     for _ in range(repeats):
         statistics, seconds = ImageStatistics(), np.zeros(4)
