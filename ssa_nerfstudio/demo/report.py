@@ -29,7 +29,7 @@ def console_table(comparison: Comparison) -> Table:
     """The figures of one dataset for the terminal."""
     table = Table(title=f"{comparison.name}: the clean scene against held-out test views")
     for heading in ("", *(heading for _, heading, _ in COLUMNS), "Gaussians", "training s"):
-        table.add_column(heading, justify="left" if not heading else "right")
+        table.add_column(heading, justify="left" if not heading else "right", no_wrap=not heading)
     for row in _rows(comparison):
         table.add_row(*row)
     return table
