@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
@@ -115,11 +116,16 @@ class Artifacts(nn.Module):
         """Take the shapes of a checkpoint's overlays, or refuse one that does not fit those that are being trained.
 
         Args:
-            state: the model's state dict.
+            state: the model's state dict; what an older version left out is added.
             prefix: under which this module's entries stand in it.
             wanted: False where an artifact must not appear: the run was asked to train without one.
         """
         count = len(state.get(f"{prefix}camera_keys", ()))
+        for overlay in (f"{prefix}overlays.{g}." for g in range(count)):
+            if len(state[f"{overlay}frame"]) == 3:  # checkpoints of when no artifact added light
+                state[f"{overlay}frame"] = F.pad(state[f"{overlay}frame"], (0, 1))
+                if f"{overlay}evidence" in state:
+                    state[f"{overlay}near"] = torch.ones_like(state[f"{overlay}evidence"])
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
         given = f"{prefix}overlays.0.transmittance" in state
         if len(self) or len(self.bare_keys):

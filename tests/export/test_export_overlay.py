@@ -210,17 +210,21 @@ def test_a_training_keeps_its_lens_in_the_checkpoint(broken_scene, tmp_path):
 
 
 def old_run(folder: Path) -> Path:
-    """A checkpoint of the first version, which kept no lenses."""
+    """A checkpoint of the first version, which kept no lenses and whose artifacts added no light."""
     config = write_run(folder, one_camera(learned()))
     path = next((folder / "nerfstudio_models").iterdir())
     saved = torch.load(path, weights_only=True)
-    del saved["pipeline"]["_model.artifacts.lenses"]
+    state, overlay = saved["pipeline"], "_model.artifacts.overlays.0."
+    del state["_model.artifacts.lenses"], state[f"{overlay}near"]
+    state[f"{overlay}frame"] = state[f"{overlay}frame"][:3]
     torch.save(saved, path)
     return config
 
 
-def test_a_checkpoint_without_lenses_is_still_read(tmp_path, capsys):
+def test_a_checkpoint_of_the_first_version_is_still_read(tmp_path, capsys):
     export(old_run(tmp_path / "run"), tmp_path / "out")
+    export(write_run(tmp_path / "new", one_camera(learned())), tmp_path / "of-new")
+    assert (tmp_path / "out" / "overlay.png").read_bytes() == (tmp_path / "of-new" / "overlay.png").read_bytes()
     with pytest.raises(BadInput):
         export(old_run(tmp_path / "run"), tmp_path / "raw", "--raw-frame")
     assert "leave out --raw-frame" in capsys.readouterr().err
