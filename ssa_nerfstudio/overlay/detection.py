@@ -51,6 +51,8 @@ LOW_DEVIATION = 0.2
 """Deviation relative to the capture's (its 75th percentile) below which a pixel can be behind an opaque artifact."""
 HALF_A_GREY_LEVEL = 0.5 / 255
 """Deviations below this are low in any capture, and tell of no displacement."""
+CLIPPED = 1.5 / 255
+"""Colours this near to black or white in all channels say nothing: whatever exceeds the range looks constant."""
 OPAQUE_SHARE = 0.25
 """Share of the artifact's area that has to be opaque for that verdict."""
 NEAR = 16
@@ -131,14 +133,22 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
 
 
 def static_area(statistics: ImageStatistics) -> StaticArea:
-    """The area of static edges; nothing where there are too few to report, everything where there are too few views."""
+    """The area of static edges, and everything where there are too few views.
+
+    Where there are too few edges to report, what no view changes by half a grey level: no scene is so constant, unless
+    it is clipped to black or white.
+    """
     if int(statistics.views.max()) < LEAST_VIEWS:
         everything = torch.ones(statistics.size, dtype=torch.bool)
         return StaticArea(everything, everything, False)
     moments, still = _look(statistics)
     fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
     if _strength(_shares(fields, still)) < 1:
-        return _nowhere(statistics)
+        mean, deviation = statistics.mean(), statistics.deviation()
+        constant = deviation[..., 0] < HALF_A_GREY_LEVEL
+        if not constant.all():
+            constant &= ~((mean < CLIPPED).all(dim=-1) | (mean > 1 - CLIPPED).all(dim=-1))
+        return StaticArea(constant.cpu(), constant.cpu(), False)
     return _area(statistics, _edges(fields, still))[0]
 
 

@@ -99,6 +99,19 @@ def test_a_plain_sky_without_static_edges_is_no_artifact():
     assert not detect(statistics).mask[:24].any()
 
 
+def test_what_never_changes_is_spared_without_static_edges_unless_it_is_clipped(monkeypatch):
+    """With few views a plain board's edge is not significant; but no scene is the same to the last bit."""
+    monkeypatch.setattr("ssa_nerfstudio.overlay.detection.LEAST_SHARES", (1.0, 1.0))
+    photos = capture(8)
+    for photo in photos:
+        photo[:, :20], photo[:, 20:40] = (200, 120, 30), 255
+    area = static_area(statistics_of(photos))
+    assert area.inside[:, :20].all()
+    assert not area.inside[:, 20:].any()
+    white = static_area(statistics_of([np.full_like(photo, 255) for photo in photos]))
+    assert white.inside.all(), "of a frame that never changes anywhere there is nothing else to say"
+
+
 def test_without_static_edges_nothing_is_spared_and_without_views_all_is():
     """Where nothing static was found, none is likely; six views and fewer say nothing, as in the paper all may be."""
     found, unknown = static_area(statistics_of(capture(30))), static_area(statistics_of(capture(4)))
