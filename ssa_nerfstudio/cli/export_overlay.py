@@ -70,7 +70,7 @@ class Command:
         for number, camera in enumerate(written["cameras"]):
             console.print(
                 f"{self.output / camera['folder']}: camera {number}, {camera['frame']} frame, "
-                f"{camera['covered_fraction']:.1%} covered, mean matte {camera['mean_matte']:.3f}"
+                f"{camera['covered_fraction']:.1%} more than half hidden, mean matte {camera['mean_matte']:.3f}"
             )
         if recovered:
             hidden = sum(r.hidden for r in recovered) / len(recovered)

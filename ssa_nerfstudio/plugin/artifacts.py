@@ -110,7 +110,7 @@ class Artifacts(nn.Module):
     def figures(self, group: int) -> str:
         """`covered` in words."""
         fraction, mean = (float(value) for value in self.covered(group))
-        return f"{fraction:.1%} of the frame covered, mean matte {mean:.3f}"
+        return f"{fraction:.1%} of the frame more than half hidden, mean matte {mean:.3f}"
 
     def make_room(self, state: dict[str, Any], prefix: str, wanted: bool) -> None:
         """Take the shapes of a checkpoint's overlays, or refuse one that does not fit those that are being trained.
