@@ -1,6 +1,7 @@
 """Hard cases of the rasterizers: `cpu` in float32 stays finite, and in float64 agrees with `reference`.
 
-On a machine with CUDA gsplat is held to the same cases in float32 (`-k gsplat` lists what differs).
+On a machine with CUDA gsplat is held to the same cases in float32; `python tests/stability/compare_bodies.py` tells what
+differs.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ RASTERIZER = Family("Rasterizer")
 WIDTH, HEIGHT = 34, 22
 BODY: RasterizerName = "cpu"
 """The body that is held to the cases in float32."""
+SINGLE_PRECISION: list[dict[str, float]] = []
+"""Relative errors of BODY in float32 by output, one entry for every scene that was drawn."""
 Gaussians = dict[str, Tensor]
 
 
@@ -57,6 +60,7 @@ def hold(scene: Gaussians, *, focal: float = 30.0, size=(WIDTH, HEIGHT), toleran
         assert [name for name, value in drawn.items() if not torch.isfinite(value).all()] == []
         assert drawn["alpha"].min() >= 0
         assert drawn["alpha"].max() <= 1
+    SINGLE_PRECISION.append({name: relative_error(narrow[name].cpu().double(), oracle[name]) for name in oracle})
     errors = {name: relative_error(double[name], oracle[name]) for name in oracle}
     assert all(error < tolerance for error in errors.values()), errors
     return oracle
