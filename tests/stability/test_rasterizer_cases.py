@@ -1,7 +1,7 @@
 """Hard cases of the rasterizers: `cpu` in float32 stays finite, and in float64 agrees with `reference`.
 
-On a machine with CUDA gsplat is held to the same cases in float32; `python tests/stability/compare_bodies.py` tells what
-differs.
+On a machine with CUDA gsplat is held to the same cases in float32; `python tests/stability/compare_bodies.py` tells
+what differs.
 """
 
 from __future__ import annotations
