@@ -26,23 +26,26 @@ def shipped(kind: Kind) -> dict[str, Path]:
     return {path.stem: path for path in sorted((folder / kind).glob("*.yaml"))}
 
 
-def locate(kind: Kind, name: str) -> Path:
+def locate(kind: Kind, name: str, stated_in: str = "") -> Path:
     """The file of a configuration.
 
     Args:
         kind: folder to look in.
         name: that of a shipped configuration, or the path of a .yaml file.
+        stated_in: file and key that name it, for messages.
 
     Raises:
         BadInput: there is none.
     """
+    where = f"{stated_in}: " if stated_in else ""
     if Path(name).suffix in (".yaml", ".yml"):
         if not Path(name).is_file():
-            raise refuse(f"{name} does not exist; give the path of a .yaml file or a name ({', '.join(shipped(kind))})")
+            known = ", ".join(shipped(kind))
+            raise refuse(f"{where}{name} does not exist; give the path of a .yaml file or a name ({known})")
         return Path(name)
     if name not in shipped(kind):
         raise refuse(
-            f"{kind} has no {name!r}{_suggestion(name, shipped(kind))}; "
+            f"{where}{kind} has no {name!r}{_suggestion(name, shipped(kind))}; "
             f"choose one of {', '.join(shipped(kind))}, or give the path of a .yaml file"
         )
     return shipped(kind)[name]

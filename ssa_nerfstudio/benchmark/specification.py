@@ -111,6 +111,9 @@ class Tradeoff:
         for number, variation in enumerate(self.together):
             if not isinstance(variation, dict) or not variation:
                 raise ValueError(f"together[{number}] must be keys and values, got {variation!r}")
+        single = [{name: setting} for name, settings in self.knobs.items() for setting in settings]
+        for settings in (self.base, *single, *self.together):
+            _check_knobs(settings)
 
 
 @dataclass(frozen=True)
@@ -142,10 +145,14 @@ class Benchmark:
         names = [scene.title for scene in self.scenes]
         if not names or len(set(names)) < len(names):
             raise ValueError(f"scenes need names of their own, and at least one is needed; got {names}")
+        for settings in (self.model, *(scene.model for scene in self.scenes)):
+            _check_names(settings, "a setting of the model")
         known = [*METHODS, *self.candidates]
         for name in self.candidates:
             if name in METHODS or not isinstance(self.candidates[name], dict):
                 raise ValueError(f"candidate {name!r} must be keys and values under a name that no method has")
+            _check_names(self.candidates[name], f"a setting of candidate {name!r}")
+        _check_names(self.candidates, "a candidate")
         for part in self.parts:
             _require(part.methods, known, "method")
             _require(part.scenes or (), names, "scene")
@@ -166,6 +173,24 @@ def read_benchmark(name: str) -> Benchmark:
     path = locate("benchmarks", name)
     values = read(path)
     return build(Benchmark, {"name": path.stem, **values}, str(path))
+
+
+def _check_knobs(settings: dict[Any, Any]) -> None:
+    """Knobs that are no setting of the model, which checks its own."""
+    _check_names(settings, "a knob")
+    steps, scale = settings.get("steps", 1), settings.get("image_scale", 1.0)
+    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+        raise ValueError(f"steps must be whole numbers from 1 on, got {steps!r}")
+    if not isinstance(scale, (int, float)) or isinstance(scale, bool) or not 0 < scale <= 1:
+        raise ValueError(f"image_scale must be above 0 and at most 1, got {scale!r}")
+    if settings.get("densification", "adc") not in ("adc", "mcmc"):
+        raise ValueError(f"densification must be adc or mcmc, got {settings['densification']!r}")
+
+
+def _check_names(settings: dict[Any, Any], what: str) -> None:
+    for name in settings:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"{what} must have a name, got {name!r}")
 
 
 def _require(names: tuple[str, ...], known: list[str], what: str) -> None:

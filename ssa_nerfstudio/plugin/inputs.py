@@ -68,6 +68,8 @@ def check_transforms(data: Path) -> None:
         raise refuse(f"{path} does not exist; give --data a folder that ns-process-data or ssa process made")
     try:
         frames = json.loads(path.read_text())["frames"]
+        if not isinstance(frames, list):
+            raise TypeError
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise refuse(f"{path} is no valid JSON ({error}); write it again with ns-process-data") from error
     except (KeyError, TypeError) as error:
@@ -88,8 +90,7 @@ def check_transforms(data: Path) -> None:
                 f"{path}: the pose of {name} is no 4 x 4 matrix of finite numbers; remove that frame "
                 "or register it again"
             )
-        photo = path.parent / str(name)
-        if not photo.exists() and not list(path.parent.glob(f"{photo.parent.name}_*/{photo.name}")):
+        if not _found(path.parent / str(name)):
             raise refuse(f"{path} names {name}, which does not exist; put the photo there or remove the frame")
     positions = np.array([np.array(frame["transform_matrix"], dtype=float)[:3, 3] for frame in frames])
     if (positions == positions[0]).all():
@@ -97,6 +98,14 @@ def check_transforms(data: Path) -> None:
             f"{path}: all cameras are in one place, from which no depth can be seen; move the camera between photos, "
             "or register them again"
         )
+
+
+def _found(photo: Path) -> bool:
+    """Whether there is a photo, in its folder or in a reduced copy beside it (images_4)."""
+    try:
+        return photo.exists() or bool(list(photo.parent.parent.glob(f"{photo.parent.name}_*/{photo.name}")))
+    except OSError:  # no path: too long
+        return False
 
 
 def check_views(outputs: DataparserOutputs, source: Path) -> None:

@@ -200,11 +200,20 @@ class Dataset:
             raise refuse(f"{path} leaves no photo to train on; add photos or hold fewer back for evaluation")
         names = [name for view in self.views for name in (view.path, *(name for _, name in view.companions))]
         for name in [*names, *self.points]:
+            if not isinstance(name, str):
+                raise refuse(f"{path}: {name!r} stands where a file's path is expected; mend or remove it")
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
                 raise refuse(f"{path}: {name} lies outside the dataset; put it inside and state its relative path")
         for view in self.views:
-            if not self.source(view.path).is_file():
+            if not _is_file(self.source(view.path)):
                 raise refuse(f"{self.source(view.path)} does not exist; put the photo there or remove its frame")
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # no path: too long
+        return False
 
 
 def _without(paths: list[str], others: list[str]) -> list[str]:

@@ -80,15 +80,19 @@ class Scene:
         return [(zlib.crc32(name.encode()), names[:number].count(name)) for number, name in enumerate(names)]
 
 
-def read_effects(names: tuple[str, ...]) -> tuple[tuple[str, Effect], ...]:
+def read_effects(names: tuple[str, ...], stated_in: str = "") -> tuple[tuple[str, Effect], ...]:
     """Effects from shipped names or .yaml files.
+
+    Args:
+        names: names, or paths of .yaml files.
+        stated_in: file and key that name them, for messages.
 
     Raises:
         BadInput: one cannot be found or is faulty.
     """
     effects = []
     for name in names:
-        path = locate("effects", name)
+        path = locate("effects", name, stated_in)
         effects.append(_effect(read(path), str(path)))
     return tuple(effects)
 
@@ -104,7 +108,7 @@ def read_scene(name: str) -> Scene:
     effects: list[tuple[str, Effect]] = []
     for number, item in enumerate(stated.effects):
         if isinstance(item, str):
-            effects += read_effects((item,))
+            effects += read_effects((item,), f"{path}: effects[{number}]")
         else:
             effects.append(_effect(item, f"{path}: effects[{number}]"))
     return Scene(tuple(effects), stated.seed)
