@@ -108,8 +108,9 @@ def test_transforms_are_read_or_refused(data, dataset, tmp_path_factory):
 @given(data=st.data())
 def test_scenes_and_effects_are_read_or_refused(data, tmp_path_factory):
     folder = tmp_path_factory.mktemp("s")
-    for kind, read in (("scenes", read_scene), ("effects", lambda path: read_effects((path,)))):
-        path = data.draw(st.sampled_from(sorted(shipped(kind).values())))
+    readers = ((shipped("scenes"), read_scene), (shipped("effects"), lambda path: read_effects((path,))))
+    for files, read in readers:
+        path = data.draw(st.sampled_from(sorted(files.values())))
         (folder / path.name).write_text(yaml.safe_dump(mutated(yaml.safe_load(path.read_text()), data.draw)))
         try:
             read(str(folder / path.name))
