@@ -70,7 +70,8 @@ class Command:
         for number, camera in enumerate(written["cameras"]):
             console.print(
                 f"{self.output / camera['folder']}: camera {number}, {camera['frame']} frame, "
-                f"{camera['covered_fraction']:.1%} more than half hidden, mean matte {camera['mean_matte']:.3f}"
+                f"{camera['covered_fraction']:.1%} with a matte above {self.threshold:g}, mean matte "
+                f"{camera['mean_matte']:.3f}"
             )
         if recovered:
             hidden = sum(r.hidden for r in recovered) / len(recovered)
@@ -80,3 +81,8 @@ class Command:
                 f"above 0.95 and could not be recovered (black). Where the artifact is estimated wrongly, pixels leave "
                 f"the range of colours: at most {implausible.implausible:.1%} of a photo ({implausible.path})."
             )
+            if clipped := sum(r.clipped for r in recovered) / len(recovered):
+                console.print(
+                    f"The artifact adds light, and {clipped:.1%} of the pixels are white by it: there the scene is at "
+                    "least as bright as what was written."
+                )

@@ -19,8 +19,9 @@ from ssa_nerfstudio.overlay.pictures import over_checkerboard
 FILES = {
     "overlay.png": "RGBA, 8 bits, straight alpha, sRGB as the photos",
     "overlay_16bit.png": "RGBA, 16 bits, straight alpha, sRGB as the photos",
-    "overlay_premultiplied.npy": "float32 [H, W, 4]: A W and A, premultiplied",
-    "matte.png": "A, 16 bits, white is opaque",
+    "overlay_premultiplied.npy": "float32 [H, W, 4]: A W and A, premultiplied; exact also of light that hides nothing, "
+    "A W above A",
+    "matte.png": "A of overlay.png, 16 bits, white is opaque; of light that hides nothing the least that can carry it",
     "mask_white_is_scene.png": "8 bits, 0 where the matte exceeds the threshold, else 255: for nerfstudio (mask_path) "
     "and COLMAP (ImageReader.camera_mask_path), which both ignore black",
     "mask_white_is_artifact.png": "the same mask inverted, for inpainting and editing tools",
@@ -70,7 +71,7 @@ def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dic
     straight = np.concatenate([color[..., ::-1], alpha], axis=-1)  # OpenCV's order
     _write_png(folder / "overlay.png", quantised(straight, np.uint8))
     _write_png(folder / "overlay_16bit.png", quantised(straight, np.uint16))
-    # Premultiplied, light that hides nothing has its place: colour above alpha.
+    # Premultiplied, light that hides nothing has its place (unless T differs by channel): colour above alpha.
     hides = 1 - layers.transmittance.mean(axis=-1, keepdims=True)
     np.save(folder / "overlay_premultiplied.npy", np.concatenate([layers.addition, hides], axis=-1))
     _write_png(folder / "matte.png", quantised(alpha, np.uint16))

@@ -16,7 +16,8 @@ from ssa_nerfstudio.export.layers import ArtifactLayers
 from ssa_nerfstudio.simulation.photos import UnusableFile, read_photo
 
 LEAST_TRANSMITTANCE = 0.05
-"""A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one grey level would become twenty."""
+"""A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one grey level would become twenty.
+Nor is one to which more than 0.95 of white was added: what a photo can still tell is less than that."""
 SAME_ASPECT = 0.005
 """Photos whose aspect differs by less than this, relatively, may be the trained ones at another resolution."""
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
@@ -33,6 +34,22 @@ class Recovery:
     """Fraction of pixels behind a matte above 0.95: not recovered, black."""
     implausible: float
     """Fraction of recovered pixels that came out darker than black or brighter than white by over two grey levels."""
+    clipped: float
+    """Fraction of pixels that are recovered as a lower bound: added light made the photo white."""
+
+
+def recoverable(layers: ArtifactLayers) -> np.ndarray:
+    """Where an artifact leaves enough of the scene in a photo, bool [H, W] (`LEAST_TRANSMITTANCE`)."""
+    return np.minimum(layers.transmittance, 1 - layers.addition).min(axis=-1) >= LEAST_TRANSMITTANCE
+
+
+def clipped(photo: np.ndarray, layers: ArtifactLayers) -> np.ndarray:
+    """Where a photo uint8 [H, W, 3] is white and need not be by the scene alone, bool [H, W]: I = clip(T C + B).
+
+    An artifact of one picture, T = 1 - A and B = A W, never reaches beyond white.
+    """
+    beyond = layers.transmittance + layers.addition > 1 + 0.5 / 255
+    return ((photo == 255) & beyond).any(axis=-1)
 
 
 def restore(photo: np.ndarray, layers: ArtifactLayers) -> tuple[np.ndarray, np.ndarray, float]:
@@ -46,7 +63,7 @@ def restore(photo: np.ndarray, layers: ArtifactLayers) -> tuple[np.ndarray, np.n
         The photo uint8 [H, W, 3], black where hidden; what could be recovered, bool [H, W]; and the fraction of it
         that is implausible.
     """
-    seen = layers.transmittance.min(axis=-1) >= LEAST_TRANSMITTANCE
+    seen = recoverable(layers)
     scene = photo - np.float32(255) * layers.addition
     scene /= np.maximum(layers.transmittance, np.float32(LEAST_TRANSMITTANCE))
     wrong = ((scene < -2) | (scene > 257)).any(axis=-1) & seen
@@ -117,7 +134,7 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
         sized[path] = layers
         name = f"mask_white_is_scene_{layers.camera.width}x{layers.camera.height}.png"
         if not (output / name).exists():
-            seen = layers.transmittance.min(axis=-1) >= LEAST_TRANSMITTANCE
+            seen = recoverable(layers)
             output.mkdir(parents=True, exist_ok=True)
             Image.fromarray(seen.astype(np.uint8) * 255).save(output / name)
 
@@ -131,7 +148,8 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
         place = (output / "photos" / path.relative_to(folder)).with_suffix(".png")
         place.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(place), clean[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
-        return Recovery(path.relative_to(folder), float(1 - seen.mean()), implausible)
+        lower_bound = float((clipped(photo, layers) & seen).mean())
+        return Recovery(path.relative_to(folder), float(1 - seen.mean()), implausible, lower_bound)
 
     with ThreadPoolExecutor(2) as pool:
         yield from pool.map(one, photos)

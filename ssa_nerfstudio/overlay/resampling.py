@@ -83,8 +83,9 @@ def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Ten
     """Undo `stack_premultiplied`: (colour [..., 3], matte [..., 1]); black where the matte is zero.
 
     The transmittance may have one channel or three; the matte is one minus its mean. Light that hides nothing has no
-    straight colour: it gets the least matte that can carry it.
+    straight colour: it gets the least matte that can carry it, at most 1.
     """
     alpha = torch.maximum(1.0 - transmittance.mean(dim=-1, keepdim=True), addition.amax(dim=-1, keepdim=True))
+    alpha = alpha.clamp_max(1.0)
     color = torch.where(alpha > 0, addition / alpha.clamp_min(1e-6), torch.zeros_like(addition))
     return color.clamp(0.0, 1.0), alpha

@@ -110,7 +110,10 @@ class Artifacts(nn.Module):
     def figures(self, group: int) -> str:
         """`covered` in words."""
         fraction, mean = (float(value) for value in self.covered(group))
-        return f"{fraction:.1%} of the frame more than half hidden, mean matte {mean:.3f}"
+        overlay = self[group]
+        light = isinstance(overlay, ScreenSpaceOverlay) and overlay.adds_light
+        covered = "hidden or lit" if light else "hidden"
+        return f"{fraction:.1%} of the frame more than half {covered}, mean matte {mean:.3f}"
 
     def make_room(self, state: dict[str, Any], prefix: str, wanted: bool) -> None:
         """Take the shapes of a checkpoint's overlays, or refuse one that does not fit those that are being trained.

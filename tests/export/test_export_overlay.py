@@ -123,6 +123,63 @@ def test_light_that_no_rgba_picture_can_hold_is_reported(tmp_path):
     assert lost[1]["lost_in_rgba_grey_levels"] < 0.01
 
 
+def shining() -> ScreenSpaceOverlay:
+    """A learned artifact that adds light: bright drops that hide little, one so bright that nothing is left."""
+    overlay = ScreenSpaceOverlay(HEIGHT, WIDTH, adds_light=True)
+    light = torch.full((HEIGHT, WIDTH, 3), 0.01)
+    light[10:20, 10:40] = torch.tensor([0.7, 0.6, 0.5])
+    light[30:40, 10:40] = torch.tensor([0.2, 0.3, 0.1])
+    light[50:60, 10:40] = 0.97
+    with torch.no_grad():
+        overlay.color_logits.copy_(light.logit())
+        overlay.alpha_logits.fill_(torch.tensor(0.02).logit())
+    return overlay
+
+
+def test_light_is_exported_with_the_least_matte_that_carries_it(tmp_path):
+    overlay = shining()
+    about = export(write_run(tmp_path / "run", one_camera(overlay)), tmp_path / "out")["cameras"][0]
+    light, hides = overlay.color().detach().numpy(), overlay.matte().detach().numpy()
+    least = np.maximum(hides, light.max(axis=-1, keepdims=True))
+    rgba = read_rgba(tmp_path / "out" / "overlay_16bit.png")
+    np.testing.assert_allclose(rgba[..., 3:], least, atol=1e-4)
+    # In front of black, the picture is what the artifact adds.
+    np.testing.assert_allclose(laid_over(rgba, np.zeros(3)) / 255, light, atol=1e-4)
+    matte = cv2.imread(str(tmp_path / "out" / "matte.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_allclose(matte / 65535, least[..., 0], atol=1e-4)
+    artifact = np.asarray(Image.open(tmp_path / "out" / "mask_white_is_artifact.png")) > 0
+    np.testing.assert_array_equal(artifact, least[..., 0] > 0.5)
+    assert about["covered_fraction"] == pytest.approx(600 / (WIDTH * HEIGHT))
+    assert about["lost_in_rgba_grey_levels"] == pytest.approx(255 * (least - hides).mean(), rel=1e-3)
+    premultiplied = np.load(tmp_path / "out" / "overlay_premultiplied.npy")
+    np.testing.assert_allclose(premultiplied, np.concatenate([light, hides], -1), atol=1e-6)
+    given_again = np.load(tmp_path / "out" / "layers.npz")
+    np.testing.assert_allclose(given_again["T"], 1 - hides.repeat(3, axis=-1), atol=1e-6)
+    np.testing.assert_allclose(given_again["B"], light, atol=1e-6)
+
+
+def test_photos_lose_light_and_it_is_told_where_they_are_white_by_it(tmp_path, capsys):
+    overlay, truth = shining(), photo(4).astype(int)
+    transmittance, addition = (layer.detach().numpy() for layer in overlay.layers())
+    full = transmittance * (truth / 255) + addition
+    shot = np.rint(255 * full.clip(0, 1)).astype(np.uint8)
+    (tmp_path / "photos").mkdir()
+    Image.fromarray(shot).save(tmp_path / "photos" / "a.png")
+    export(write_run(tmp_path / "run", one_camera(overlay)), tmp_path / "out", "--apply", tmp_path / "photos")
+    restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
+    lost = (addition > 0.95).any(axis=-1)
+    white = (shot == 255).any(axis=-1) & ~lost
+    assert white.any()
+    assert not restored[lost].any()
+    assert np.abs(restored - truth)[~lost & ~white].max() <= 1
+    assert (restored <= truth + 1)[white].all()
+    said = capsys.readouterr().out
+    assert f"{lost.mean():.1%} of their pixels" in said
+    assert f"{white.mean():.1%} of the pixels are white by it" in said
+    seen = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png"))
+    np.testing.assert_array_equal(seen == 0, lost)
+
+
 def test_the_layers_can_be_given_to_another_training(tmp_path, tiny_scene):
     config = write_run(tmp_path / "run", one_camera(learned(64, 48)))
     export(config, tmp_path / "out")
@@ -241,7 +298,9 @@ def test_photos_lose_a_watermark_and_keep_the_rest(tmp_path, capsys):
     restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "day 1" / "a.png")).astype(int)
     # One rounding, divided by a transmittance of 0.6.
     assert np.abs(restored - truth).max() <= 2
-    assert "0.0% of their pixels" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "0.0% of their pixels" in said
+    assert "adds light" not in said
 
 
 def test_what_an_opaque_artifact_hides_is_black_and_counted(tmp_path, capsys):

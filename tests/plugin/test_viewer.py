@@ -120,6 +120,26 @@ def test_strength_scales_the_matte(model, camera):
     torch.testing.assert_close(half["rgb"], 0.5 * (plain["rgb"] + plain["composite"]), atol=1e-5, rtol=0)
 
 
+def test_light_that_hides_nothing_is_added_and_shown_with_the_least_matte(model, camera, monkeypatch):
+    overlay = model.artifacts.learned()[0]
+    monkeypatch.setattr(overlay, "adds_light", True)
+    light, hides = overlay.color().detach(), overlay.matte().detach()
+    assert (light.amax(dim=-1, keepdim=True) > hides + 0.1).any()
+    clean = frame(model, camera)["rgb"]
+    choose(model, a_show=True)
+    seen = frame(model, camera)
+    torch.testing.assert_close(seen["rgb"], ((1 - hides) * clean + light).clamp(0, 1))
+    torch.testing.assert_close(seen["overlay_alpha"], torch.maximum(hides, light.amax(dim=-1, keepdim=True)))
+    torch.testing.assert_close(seen["overlay_alpha"] * seen["overlay_rgb"], light)
+    choose(model, c_strength=0.5)
+    half = frame(model, camera)
+    torch.testing.assert_close(half["rgb"], ((1 - 0.5 * hides) * clean + 0.5 * light).clamp(0, 1))
+    torch.testing.assert_close(half["overlay_alpha"], 0.5 * seen["overlay_alpha"])
+    choose(model, b_layer="matte")
+    torch.testing.assert_close(frame(model, camera)["rgb"], half["overlay_alpha"].expand_as(clean))
+    assert "more than half hidden or lit" in model.artifacts.figures(0)
+
+
 @pytest.mark.parametrize(("width", "height"), [(200, 48), (64, 200), (30, 30), (513, 385)])
 def test_any_viewport_shows_the_artifact_letterboxed(model, camera, width, height):
     camera.width[:], camera.height[:] = width, height
