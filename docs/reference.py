@@ -34,7 +34,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 def _command(name: str) -> str:
     command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
-    rows = [(_option(field.name), field, text) for field, text in _fields(command)]
+    rows = [
+        (field.name.upper() if _positional(field) else _option(field.name), field, text)
+        for field, text in _fields(command)
+    ]
     return f"## `ssa {name}`\n\n{COMMANDS[name]}\n\n{_table(rows)}"
 
 
@@ -62,13 +65,21 @@ def _fields(cls: type) -> list[tuple[dataclasses.Field, str]]:
 def _table(rows: list[tuple[str, dataclasses.Field, str]]) -> str:
     lines = ["| option | type | default | |", "|---|---|---|---|"]
     for option, field, text in rows:
-        cells = (f"`{option}`", f"`{_type(field)}`", _default(field), text)
-        lines.append("| " + " | ".join(re.sub(r"\s+", " ", cell).replace("|", "\\|") for cell in cells) + " |")
+        # Within backticks Markdown takes | and * as they are, and would show a backslash in front of them.
+        prose = re.sub(r"(`[^`]*`)|([|*])", lambda found: found[1] or f"\\{found[2]}", text)
+        cells = (f"`{option}`", f"`{_type(field)}`", _default(field), prose)
+        lines.append("| " + " | ".join(re.sub(r"\s+", " ", cell) for cell in cells) + " |")
     return "\n".join(lines) + "\n"
 
 
+def _positional(field: dataclasses.Field) -> bool:
+    """Whether it is written without a flag."""
+    return "tyro.conf.Positional" in str(field.type)
+
+
 def _type(field: dataclasses.Field) -> str:
-    return field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
+    text = field.type if isinstance(field.type, str) else getattr(field.type, "__name__", str(field.type))
+    return text.removeprefix("Annotated[").partition(", tyro.")[0]
 
 
 def _default(field: dataclasses.Field) -> str:

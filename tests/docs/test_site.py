@@ -31,6 +31,11 @@ def test_every_command_and_its_options_are_in_the_site(site):
     page = (site / "commands.html").read_text()
     assert all(f"<code>ssa {name}</code>" in page for name in COMMANDS)
     assert "<code>--raw-frame</code>" in page
+    assert "<code>BENCHMARK</code>" in page
+    assert "<code>int | None</code>" in page
+    assert "*-rain-*" in page
+    assert "Annotated" not in page
+    assert "\\|" not in page
 
 
 def test_every_setting_of_the_model_is_in_the_site(site):
