@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -69,6 +70,21 @@ def checkpoint(config: Path) -> dict:
 
 def test_a_killed_run_resumes_to_the_step_that_was_asked_for(config):
     assert checkpoint(config)["step"] == 249
+
+
+def test_tensorboard_gets_the_artifact_as_pictures_and_figures(config):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    log = EventAccumulator(str(config.parent)).Reload()
+    assert {f"Train Metrics Dict/overlay_{name}" for name in ("covered", "matte")} <= set(log.Tags()["scalars"])
+    assert "Train Loss Dict/sparsity" in log.Tags()["scalars"]
+    for name in ("clean_and_composite", "overlay_and_matte"):
+        newest = log.Images(f"Eval Images/{name}")[-1]
+        assert (newest.step, newest.width, newest.height) == (200, 128, 48)
+        picture = np.asarray(Image.open(io.BytesIO(newest.encoded_image_string)).convert("RGB")) / 255
+        # The dashboard is at the bottom: it changes the scene there, and its matte is white.
+        left, right = picture[-4:, 16:48], picture[-4:, 80:112]
+        assert right.mean() > 0.8 if name == "overlay_and_matte" else np.abs(left - right).mean() > 0.05
 
 
 def test_eval_writes_the_metrics_of_the_clean_render(config, tmp_path):
