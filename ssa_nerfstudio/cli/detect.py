@@ -46,6 +46,8 @@ class Command:
                 raise refuse(f"--{name} must be at least {lowest}, got {value}")
         if self.json is not None and not self.json.parent.is_dir():
             raise refuse(f"--json {self.json}: there is no folder {self.json.parent}; make it first")
+        if self.json is not None and self.json.is_dir():
+            raise refuse(f"--json {self.json} is a folder; name a file")
         if self.output is not None and self.output.exists():
             raise refuse(f"{self.output} exists already; remove it or name another folder with --output")
         output = self.output or Path("outputs/detection") / self.data.resolve().stem
@@ -56,11 +58,8 @@ class Command:
             shutil.rmtree(output, ignore_errors=True)
         with staged_folder(output) as folder:
             write_detections(folder, found)
-        if self.json is not None:
-            try:
-                self.json.write_text(as_json(found), encoding="utf-8")
-            except OSError as error:
-                raise refuse(f"{self.json} cannot be written ({error}); name another file") from error
+            if self.json is not None:
+                _write(self.json, as_json(found))
         for name, detection in found.items():
             low, high = detection.p_interval
             camera = f"{name}: " if len(found) > 1 else ""
@@ -68,8 +67,20 @@ class Command:
                 console.print(f"{camera}{detection.views} views are too few to tell; {LEAST_VIEWS} are needed")
                 continue
             covered = f", {detection.coverage:.1%} of the frame" if detection.verdict != "none" else ""
+            covered = ", too few static edges to report" if detection.slight else covered
             console.print(
                 f"{camera}{detection.verdict}{covered} ({detection.views} views, p = {detection.p_value:.3g}, "
                 f"false alarms [{low:.3f}, {high:.3f}])"
             )
         console.print(f"{output}: evidence.png, and masks whose black is the artifact")
+
+
+def _write(path: Path, text: str) -> None:
+    """In place, not by renaming, because it may be /dev/stdout; of a new file nothing stays where it fails."""
+    new = not path.exists()
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        if new:
+            path.unlink(missing_ok=True)
+        raise refuse(f"{path} cannot be written ({error}); free space there or name another file") from error

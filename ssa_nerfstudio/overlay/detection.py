@@ -102,6 +102,11 @@ class Detection:
         """[H, W] bool: True where the artifact is."""
         return self.area.inside
 
+    @property
+    def slight(self) -> bool:
+        """Verdict none although the static edges are no chance: there are too few of them to report."""
+        return self.verdict == "none" and self.p_value <= SIGNIFICANCE
+
 
 def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> Detection:
     """Test whether the views have a static artifact in front of them.

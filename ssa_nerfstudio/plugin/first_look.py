@@ -88,6 +88,7 @@ def _found(detection: Detection, name: str) -> bool:
         )
         return True
     reason = "too few to tell" if detection.views < LEAST_VIEWS else f"p = {detection.p_value:.2g}"
+    reason += ", too few static edges to report" if detection.slight else ""
     CONSOLE.print(
         f"{name[0].upper()}{name[1:]} show no static artifact ({detection.views} views, {reason}): training without an "
         "overlay. (--pipeline.model.overlay on: with one.)"

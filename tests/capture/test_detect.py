@@ -160,7 +160,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, compl
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
-@pytest.mark.parametrize("options", [["--draws", "10"], ["--json", "nowhere/found.json"], ["--threads", "0"]])
+@pytest.mark.parametrize(
+    "options", [["--draws", "10"], ["--json", "nowhere/found.json"], ["--json", "/"], ["--threads", "0"]]
+)
 def test_arguments_that_make_no_sense_are_refused(tmp_path, capsys, options):
     with pytest.raises(SystemExit) as refused:
         main(["detect", "--data", str(tmp_path), *options])
@@ -168,13 +170,23 @@ def test_arguments_that_make_no_sense_are_refused(tmp_path, capsys, options):
     assert options[0] in capsys.readouterr().err
 
 
-def test_a_full_disk_leaves_nothing(tmp_path):
-    """A limit on the size of files stands in for it: writing fails as on a full disk, in a real process."""
+@pytest.mark.parametrize(("plain", "largest"), [(False, 64), (True, 300)], ids=["pictures", "json"])
+def test_a_full_disk_leaves_nothing(plain, largest, tmp_path):
+    """A limit on the size of files stands in for it: writing fails as on a full disk, in a real process.
+
+    Of plain photos the pictures are so small that only the report does not fit.
+    """
     data = photos(tmp_path / "photos")
+    if plain:
+        for path in data.iterdir():
+            Image.new("RGB", (96, 64), (90, 90, 90)).save(path)
     limited = "import resource, signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
-    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (64, 64)); from ssa_nerfstudio.cli import main; "
-    limited += f"main(['detect', '--data', {str(data)!r}, '--output', {str(tmp_path / 'found')!r}])"
+    limited += f"resource.setrlimit(resource.RLIMIT_FSIZE, ({largest}, {largest})); "
+    limited += "from ssa_nerfstudio.cli import main; "
+    limited += f"main(['detect', '--data', {str(data)!r}, '--output', {str(tmp_path / 'found')!r}, "
+    limited += f"'--json', {str(tmp_path / 'found.json')!r}])"
     done = subprocess.run([sys.executable, "-c", limited], capture_output=True, text=True)
     assert done.returncode == 2, done.stderr
-    assert "cannot be written" in done.stderr.splitlines()[-1]
+    (line,) = done.stderr.splitlines()
+    assert f"found{'.json' * plain} cannot be written" in line
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
