@@ -34,6 +34,8 @@ COARSE = 4
 """The second scale: this many working pixels a side, for soft edges (a finger, thick drops)."""
 LEAST_SHARES = (0.003, 0.015)
 """Share of static edges above the null's mean, at the fine and the coarse scale, below which nothing is reported."""
+LEAST_PLAIN = 0.01
+"""Share of the frame that is opaque and enclosed by static edges, from which on their number does not matter."""
 WINDOWS = (21, 11)
 """Side of the window in which a displacement is fitted, pixels at the fine and at the coarse scale; odd."""
 DISPLACED_SHARES = (0.03, 0.05)
@@ -129,9 +131,9 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
     fine, coarse = (float(np.mean(scale)) for scale in zip(*null, strict=True))
     excess = shares[0] - fine, shares[1] - coarse
     interval = _interval(reached, draws)
-    if p_value > SIGNIFICANCE or _strength(excess) < 1:
-        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere)
     area, opaque_share = _area(statistics, _edges(fields, still))
+    if p_value > SIGNIFICANCE or (_strength(excess) < 1 and opaque_share < LEAST_PLAIN):
+        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere)
     coverage = float(area.inside.float().mean())
     verdict = "opaque" if opaque_share >= OPAQUE_SHARE * coverage else "faint"
     return Detection(verdict, coverage, p_value, interval, views, shares, (fine, coarse), evidence, area)
@@ -148,13 +150,14 @@ def static_area(statistics: ImageStatistics) -> StaticArea:
         return StaticArea(everything, everything, False)
     moments, still = _look(statistics)
     fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
-    if _strength(_shares(fields, still)) < 1:
+    area, opaque_share = _area(statistics, _edges(fields, still))
+    if _strength(_shares(fields, still)) < 1 and opaque_share < LEAST_PLAIN:
         mean, deviation = statistics.mean(), statistics.deviation()
         constant = deviation[..., 0] < HALF_A_GREY_LEVEL
         if not constant.all():
             constant &= ~((mean < CLIPPED).all(dim=-1) | (mean > 1 - CLIPPED).all(dim=-1))
         return StaticArea(constant.cpu(), constant.cpu(), False)
-    return _area(statistics, _edges(fields, still))[0]
+    return area
 
 
 def _nowhere(statistics: ImageStatistics) -> StaticArea:

@@ -85,6 +85,19 @@ def test_an_opaque_board_is_found_with_its_plain_inside():
     assert found.mask[:66].float().mean() < 0.01
 
 
+@pytest.mark.parametrize("views", [12, 40])
+def test_a_plain_corner_is_found_though_it_has_few_edges(views):
+    """A thumb, a tripod's leg: 6 % of the frame, whose edges alone would be too few to report."""
+    matte = np.zeros((480, 640))
+    matte[360:, :160] = 1.0
+    photos = behind([cv2.resize(photo, (640, 480)) for photo in capture(views)], matte)
+    found = detect(statistics_of(photos))
+    assert detection._strength(found.shares) < 1
+    assert found.verdict == "opaque"
+    assert found.mask[362:, :158].all()
+    assert found.coverage == pytest.approx(0.0625, abs=0.02)
+
+
 def test_a_plain_sky_without_static_edges_is_no_artifact():
     """All views agree on the upper half; its lower border moves, as a skyline does. The board below does not."""
     photos = behind(capture(30), board())
@@ -102,6 +115,7 @@ def test_a_plain_sky_without_static_edges_is_no_artifact():
 def test_what_never_changes_is_spared_without_static_edges_unless_it_is_clipped(monkeypatch):
     """With few views a plain board's edge is not significant; but no scene is the same to the last bit."""
     monkeypatch.setattr("ssa_nerfstudio.overlay.detection.LEAST_SHARES", (1.0, 1.0))
+    monkeypatch.setattr("ssa_nerfstudio.overlay.detection.LEAST_PLAIN", 1.0)
     photos = capture(8)
     for photo in photos:
         photo[:, :20], photo[:, 20:40] = (200, 120, 30), 255
