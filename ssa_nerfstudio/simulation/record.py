@@ -31,10 +31,13 @@ def transforms(dataset: Dataset, names: dict[str, str]) -> dict[str, Any]:
         meta[f"{split}_filenames"] = [names[path] for path in paths]
     if dataset.downscale_factor > 1:
         for holder in (meta, *meta["frames"]):
-            holder |= {
-                key: holder[key] / dataset.downscale_factor for key in ("fl_x", "fl_y", "cx", "cy") if key in holder
+            # Numbers may be stated as texts: nerfstudio takes them, and so do we.
+            reduced = {
+                key: float(holder[key]) / dataset.downscale_factor
+                for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")
+                if key in holder
             }
-            holder |= {key: int(holder[key] / dataset.downscale_factor) for key in ("w", "h") if key in holder}
+            holder |= {key: int(value) if key in ("w", "h") else value for key, value in reduced.items()}
     return meta
 
 

@@ -171,8 +171,10 @@ def test_a_rig_gets_layers_for_every_camera(tmp_path):
     assert (tmp_path / "out/layers/undistorted_T1.png").exists()
 
 
-def test_reduced_photos_become_a_dataset_of_their_own(tmp_path):
+@pytest.mark.parametrize("stated_as", [float, str])
+def test_reduced_photos_become_a_dataset_of_their_own(stated_as, tmp_path):
     data = write_dataset(tmp_path / "data", width=80, height=60, k1=-0.1)
+    edit(data, w=stated_as(80), cx=stated_as(40))
     (data / "images_2").mkdir()
     for path in (data / "images").iterdir():
         Image.open(path).reduce(2).save(data / "images_2" / path.name)
