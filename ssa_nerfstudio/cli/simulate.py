@@ -23,7 +23,7 @@ class Command:
     of their shipped variants, or .yaml files. `--effects` with nothing behind it copies the dataset and adds the
     split."""
     scene: str | None = None
-    """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats it."""
+    """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats its effects."""
     seed: int | None = None
     """Decides all that chance decides, not negative; the scene's own, or 0, where not given."""
     eval_interval: int = 8
