@@ -58,8 +58,9 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
         layers = artifact.whole(mean.value(), *size)
         for camera, view in enumerate(cameras):
             if view.size == size:
-                raw.add(camera, layers)
-                straight.add(camera, undistorted_layers(layers, view.lens))
+                both = ((raw, layers), (straight, undistorted_layers(layers, view.lens)))
+                # Compressing them takes as long as dozens of photos.
+                list(in_order(lambda pair, camera=camera: pair[0].add(camera, pair[1]), both, threads))
 
 
 def undistorted_layers(layers: Layers, lens: Lens) -> Layers:
