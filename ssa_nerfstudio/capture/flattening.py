@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import PIL.Image
-import scipy.fft
+
+from ssa_nerfstudio.overlay.poisson import add_divergence, integrated
 
 LEAST_PHOTOS = 8
 """Fewer photos do not tell what is static from what happens to lie at the same place."""
@@ -57,13 +58,10 @@ def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray | None:
         across, certain_across = _typical(np.diff(rows[:, :kept], axis=2))
         down, certain_down = _typical(np.diff(rows, axis=1))
         certain += certain_across + certain_down
-        divergence[top : top + kept, :-1] += across
-        divergence[top : top + kept, 1:] -= across
-        divergence[top : top + len(down)] += down
-        divergence[top + 1 : top + 1 + len(down)] -= down
+        add_divergence(divergence[top:], across, down)
     if certain < _LEAST_SHARE * 2 * height * width:
         return None
-    factor = _integrate(divergence)
+    factor = integrated(divergence)
     return factor - cv2.GaussianBlur(factor, (0, 0), min(height, width) / _COARSEST)
 
 
@@ -115,15 +113,3 @@ def _typical(gradients: np.ndarray) -> tuple[np.ndarray, int]:
         weight = 1 - np.square(_CHANCE * error / median)
     certain = int((np.abs(median) > _CERTAIN * error).sum())
     return np.where(median == 0, 0, median * weight.clip(0, None)), certain
-
-
-def _integrate(divergence: np.ndarray) -> np.ndarray:
-    """Solves Poisson's equation without flux through the border: [H, W], mean 0."""
-    height, width = divergence.shape
-    spectrum = np.asarray(scipy.fft.dctn(divergence, norm="ortho"))
-    y, x = (2 * np.cos(np.pi * np.arange(side, dtype=np.float32) / side) - 2 for side in (height, width))
-    eigenvalues = y[:, None] + x
-    eigenvalues[0, 0] = 1
-    spectrum /= eigenvalues
-    spectrum[0, 0] = 0
-    return np.asarray(scipy.fft.idctn(spectrum, norm="ortho"), dtype=np.float32)
