@@ -136,7 +136,7 @@ def _configuration(run: Run, place: Workplace) -> SSATrainerConfig:
 
 
 def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
-    """The schedules that a run really follows, in steps."""
+    """The schedules that a run really follows, in steps, and the overlay's learning rate."""
     from ssa_nerfstudio.plugin.schedules import FULL_LENGTH, scaled
 
     final = scaled(config) if config.scale_schedules else config
@@ -144,6 +144,7 @@ def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
     for name, entry in final.optimizers.items():
         if entry["scheduler"] is not None:
             values[f"learning_rate_{name}"] = entry["scheduler"].max_steps
+    values["overlay_learning_rate"] = final.optimizers["overlay"]["optimizer"].lr
     return {"factor": config.max_num_iterations / FULL_LENGTH, **values}
 
 

@@ -21,6 +21,7 @@ import torch
 from scipy.special import betaincinv
 from torch import Tensor, nn
 
+from ssa_nerfstudio.overlay.estimate import estimate, opaque
 from ssa_nerfstudio.overlay.formation import adds_light
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
@@ -58,7 +59,7 @@ CLIPPED = 1.5 / 255
 OPAQUE_SHARE = 0.25
 """Share of the artifact's area that has to be opaque for that verdict."""
 NEAR = 16
-"""Working pixels around a static edge in which its artifact may go on: the inside of letters, thin mud."""
+"""Working pixels around a static edge in which its artifact may go on: thin mud, drops whose edges were missed."""
 EDGE_SUPPORT = 0.5
 """Share of an area's outline that has to be static edges: a plain artifact has them all around, a plain sky has not."""
 _AROUND = np.ones((3, 3), np.uint8)
@@ -66,14 +67,25 @@ _AROUND = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class StaticArea:
-    """Where an artifact would be, whatever the verdict, and of which kind: what an overlay starts from."""
+    """Where an artifact would be, whatever the verdict, and what it looks like: what an overlay starts from."""
 
     inside: Tensor
     """[H, W] bool: static edges, and plain areas among them."""
     near: Tensor
-    """[H, W] bool: that, and all within NEAR working pixels of a static edge."""
+    """[H, W] bool: that, all within NEAR working pixels of a static edge, and what the edges imply."""
+    opaque: Tensor
+    """[H, W] bool: where nothing shows through (`estimate.opaque`)."""
+    matte: Tensor
+    """[H, W] in [0, 1], as the edges imply it (`estimate.estimate`)."""
+    difference: Tensor
+    """[H, W, 3] in [-1, 1]: mean of the views minus the mean without the artifact, likewise."""
     adds_light: bool
     """The artifact shines and hides nothing (`formation.adds_light`)."""
+
+    @classmethod
+    def plain(cls, constant: Tensor) -> StaticArea:
+        """Opaque where `constant` [H, W], and nothing elsewhere; without edges that say more."""
+        return cls(constant, constant, constant, torch.zeros(constant.shape), torch.zeros(*constant.shape, 3), False)
 
 
 @dataclass(frozen=True)
@@ -146,8 +158,7 @@ def static_area(statistics: ImageStatistics) -> StaticArea:
     it is clipped to black or white.
     """
     if int(statistics.views.max()) < LEAST_VIEWS:
-        everything = torch.ones(statistics.size, dtype=torch.bool)
-        return StaticArea(everything, everything, False)
+        return StaticArea.plain(torch.ones(statistics.size, dtype=torch.bool))
     moments, still = _look(statistics)
     fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
     area, opaque_share = _area(statistics, _edges(fields, still))
@@ -156,13 +167,12 @@ def static_area(statistics: ImageStatistics) -> StaticArea:
         constant = deviation[..., 0] < HALF_A_GREY_LEVEL
         if not constant.all():
             constant &= ~((mean < CLIPPED).all(dim=-1) | (mean > 1 - CLIPPED).all(dim=-1))
-        return StaticArea(constant.cpu(), constant.cpu(), False)
+        return StaticArea.plain(constant.cpu())
     return area
 
 
 def _nowhere(statistics: ImageStatistics) -> StaticArea:
-    nothing = torch.zeros(statistics.size, dtype=torch.bool)
-    return StaticArea(nothing, nothing, False)
+    return StaticArea.plain(torch.zeros(statistics.size, dtype=torch.bool))
 
 
 def _look(statistics: ImageStatistics) -> tuple[list[Tensor], list[Tensor]]:
@@ -298,11 +308,20 @@ def _area(statistics: ImageStatistics, edges: np.ndarray) -> tuple[StaticArea, f
     deviation = _deviation(statistics)
     low = _low(deviation)
     plain = _supported(low.astype(np.uint8), cv2.dilate(edges, _AROUND, iterations=2))
-    inside = torch.from_numpy(_at_full_size(cv2.dilate(edges, _AROUND) | plain, statistics))
+    mean = _at_working_size(statistics.mean(), statistics)
+    looks = estimate(mean, deviation, edges)
     distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    near = inside | torch.from_numpy(_at_full_size(distance <= NEAR, statistics))
-    mean = _at_working_size(statistics.mean(), statistics).mean(axis=0)
-    area = StaticArea(inside, near, adds_light(mean, deviation, (edges > 0) & ~low))
+    near = (distance <= NEAR) | (looks.matte > 0) | looks.difference.any(axis=0)
+    masks = cv2.dilate(edges, _AROUND) | plain, near.astype(np.uint8), opaque(plain | (edges & low), deviation)
+    inside, near, hidden = (_at_full_size(mask, statistics) > 0 for mask in masks)
+    area = StaticArea(
+        inside=inside,
+        near=inside | near,
+        opaque=hidden,
+        matte=_at_full_size(looks.matte, statistics),
+        difference=torch.stack([_at_full_size(channel, statistics) for channel in looks.difference], dim=-1),
+        adds_light=adds_light(mean.mean(axis=0), deviation, (edges > 0) & ~low),
+    )
     return area, float((plain | (edges & low)).mean())
 
 
@@ -333,12 +352,14 @@ def _at_working_size(layer: Tensor, statistics: ImageStatistics) -> np.ndarray:
     return nn.functional.avg_pool2d(planes, reduction)[0].cpu().numpy()
 
 
-def _at_full_size(mask: np.ndarray, statistics: ImageStatistics) -> np.ndarray:
-    """A mask [h, w] at the working resolution as bool [H, W]."""
+def _at_full_size(layer: np.ndarray, statistics: ImageStatistics) -> Tensor:
+    """A layer [h, w] at the working resolution as [H, W]: bytes by repetition, others linearly."""
     height, width = statistics.size
     reduction = statistics.brightness.reduction
-    enlarged = np.kron(mask.astype(np.uint8), np.ones((reduction, reduction), np.uint8))
-    return np.pad(enlarged, ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1])), mode="edge") > 0
+    way = cv2.INTER_NEAREST if layer.dtype == np.uint8 else cv2.INTER_LINEAR
+    enlarged = cv2.resize(layer, None, fx=reduction, fy=reduction, interpolation=way)
+    missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]))
+    return torch.from_numpy(np.pad(enlarged, missing, mode="edge"))
 
 
 def _settled(edges: np.ndarray, still: np.ndarray) -> np.ndarray:

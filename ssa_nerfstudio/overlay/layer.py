@@ -123,9 +123,9 @@ class ScreenSpaceOverlay(nn.Module):
     def start_from(self, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
         """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05).
 
-        A sky is as constant as a dashboard, but static edges enclose the dashboard alone. Outside of the area where
-        detection would see an artifact the matte starts at 0.1 at most (that of the constant start), far from its edges
-        at 0.01, and sparsity weighs in full.
+        A sky is as constant as a dashboard, but static edges enclose the dashboard alone. Told where an artifact would
+        be, only what is opaque starts so. Elsewhere A and W are those that its edges imply, but A at least 0.1 (that of
+        the constant start) near them and 0.01 far from them. Sparsity spares what is hidden.
 
         Args:
             statistics: of the photos.
@@ -136,29 +136,37 @@ class ScreenSpaceOverlay(nn.Module):
         """
         if statistics.size != (self.height, self.width):
             raise ValueError(f"statistics of a frame {statistics.size} for an overlay of {(self.height, self.width)}")
+        if area is None:
+            area = StaticArea.plain(torch.ones(statistics.size, dtype=torch.bool))
         mean, deviation = statistics.mean(), statistics.deviation()
+        opaque, near = (mask.to(mean.device)[..., None] for mask in (area.opaque, area.near))
+        matte, difference = area.matte.to(mean)[..., None], area.difference.to(mean)
+        least = torch.where(near, CONSTANT_START[1], MATTE_START_RANGE[0])
+        if self.adds_light:
+            matte, least = torch.zeros_like(matte), MATTE_START_RANGE[0]
         # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the
         # pixel, is 1, and its mean colour would be lost.
-        alpha = torch.exp(-deviation / STATISTICS_SCALE)
-        inside = torch.ones_like(alpha) if area is None else area.inside.to(alpha)[..., None]
-        near = torch.ones_like(alpha) if area is None else area.near.to(alpha)[..., None]
-        alpha = torch.where(inside > 0, alpha, alpha.clamp_max(CONSTANT_START[1]))
-        alpha = torch.where(near > 0, alpha, alpha.clamp_max(MATTE_START_RANGE[0]))
-        pair = torch.cat([alpha, alpha * mean, deviation, inside, near], dim=-1)
+        alpha = torch.where(opaque, torch.exp(-deviation / STATISTICS_SCALE), matte.clamp_min(least))
+        if self.adds_light:
+            addition = torch.where(opaque, alpha * mean, difference)
+        else:
+            scene = (mean - torch.where(opaque, 0.0, difference)).clamp(0, 1)
+            addition = torch.minimum(alpha * scene + mean - scene, alpha)
+        layers = torch.cat([alpha, addition, deviation, opaque, matte, near], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
             padded = nn.functional.pad(
-                pair.permute(2, 0, 1)[None],
+                layers.permute(2, 0, 1)[None],
                 (0, size[1] * self.resolution - self.width, 0, size[0] * self.resolution - self.height),
                 mode="replicate",
             )
-            pair = nn.functional.avg_pool2d(padded, self.resolution)[0].permute(1, 2, 0)
-        alpha = pair[..., :1].clamp(*MATTE_START_RANGE)
-        color = (pair[..., 1:4] / pair[..., :1]).clamp(*COLOR_START_RANGE)
-        self.color_logits.copy_((alpha * color if self.adds_light else color).logit())
-        self.alpha_logits.copy_(alpha.logit())
-        self.evidence.copy_(_evidence(pair[..., 4:5], pair[..., 5:6]))
-        self.near.copy_(pair[..., 6:] > 0)
+            layers = nn.functional.avg_pool2d(padded, self.resolution)[0].permute(1, 2, 0)
+        alpha, addition, deviation, opaque, matte, near = layers.split((1, 3, 1, 1, 1, 1), dim=-1)
+        color = addition.clamp_min(MATTE_START_RANGE[0]) if self.adds_light else addition / alpha
+        self.color_logits.copy_(color.clamp(*COLOR_START_RANGE).logit())
+        self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
+        self.evidence.copy_(torch.minimum(_evidence(deviation, opaque), 1 - matte))
+        self.near.copy_(near > 0)
 
     @torch.no_grad()
     def wait_for_the_scene(self) -> None:
@@ -249,15 +257,15 @@ def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) 
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
 
 
-def _evidence(deviation: Tensor, inside: Tensor) -> Tensor:
-    """r: how much the sparsity weighs on a pixel, 1 outside the area of an artifact (its share of the pixel).
+def _evidence(deviation: Tensor, opaque: Tensor) -> Tensor:
+    """r: how much the sparsity weighs on a pixel, 1 where nothing is opaque (its share of the pixel).
 
-    Inside, r = min(1, sigma / 70th percentile of sigma), near 0 where the views agree, so that sparsity spares what an
-    artifact hides. A sky agrees with itself, too; but no static edges enclose it, and there sparsity weighs in full.
+    There, r = min(1, sigma / 70th percentile of sigma), near 0 where the views agree, so that sparsity spares what an
+    artifact hides. A sky agrees with itself, too; but its deviation does not rise where it ends, and sparsity weighs.
     """
     values = deviation.flatten().float()
     rank = max(1, round(0.7 * values.numel()))
     reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
     if reference <= 0:
         return torch.ones_like(deviation)
-    return 1 - inside * (1 - (deviation / reference).clamp_max(1.0))
+    return 1 - opaque * (1 - (deviation / reference).clamp_max(1.0))

@@ -40,8 +40,8 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
     (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
     overlay_start: Literal["detected", "statistics", "constant"] = "detected"
-    """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); detected: that where static edges enclose it,
-    A = 0.1 at most around it and 0.01 elsewhere; constant: W = 0.5, A = 0.1 (the paper's ablation)."""
+    """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); detected: that where nothing shows through,
+    elsewhere what static edges imply; constant: W = 0.5, A = 0.1 (the paper's ablation)."""
     overlay_light: Literal["auto", "on", "off"] = "auto"
     """Whether the artifact may add light without hiding the scene (rain, glare), I = (1 - A) C + W: auto asks the
     photos where overlay_start is detected; off is the paper's I = (1 - A) C + A W."""

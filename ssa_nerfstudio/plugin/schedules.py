@@ -14,6 +14,11 @@ SHORTEST_REFINEMENT = 10
 """Refinement is never more frequent than this many steps: its statistics need a few views to mean something."""
 SHORTEST_BETWEEN_PICTURES = 100
 """Pictures in the log of a shorter run are never nearer to each other than this many steps: each is an evaluation."""
+STEPS_OF_AN_OVERLAY = 7_000
+"""An overlay needs this many steps at its learning rate. Adam moves a logit by no more than that rate a step, so in a
+shorter run it is raised in proportion ..."""
+FASTEST_OVERLAY = 4.0
+"""... up to this factor."""
 
 _MODEL_STEPS = (
     "warmup_length",
@@ -30,8 +35,8 @@ def scaled(config: SSATrainerConfig) -> SSATrainerConfig:
     """A copy of a run's configuration with every schedule scaled by its number of steps / 30000.
 
     Scaled are: learning-rate decay and warm-up, the resolution schedule, spherical harmonics, the refinement's start,
-    stop and interval, and with the interval the opacity resets, which are counted in refinements; and, so that a short
-    run is seen too, the steps between two pictures in the log.
+    stop and interval, and with the interval the opacity resets, which are counted in refinements; so that a short run
+    is seen too, the steps between two pictures in the log; and, below 7000 steps, the overlay's learning rate.
     """
     config = copy.deepcopy(config)
     factor = config.max_num_iterations / FULL_LENGTH
@@ -42,6 +47,8 @@ def scaled(config: SSATrainerConfig) -> SSATrainerConfig:
     model.refine_every = max(SHORTEST_REFINEMENT, round(model.refine_every * factor))
     pictures = max(SHORTEST_BETWEEN_PICTURES, round(config.steps_per_eval_image * factor))
     config.steps_per_eval_image = min(config.steps_per_eval_image, pictures)  # 0 stays 0: none
+    shortened = STEPS_OF_AN_OVERLAY / max(1, config.max_num_iterations)
+    config.optimizers["overlay"]["optimizer"].lr *= min(FASTEST_OVERLAY, max(1.0, shortened))
     for entry in config.optimizers.values():
         scheduler = entry["scheduler"]
         if scheduler is not None:

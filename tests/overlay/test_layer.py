@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from nerfstudio.models.splatfacto import resize_image
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.detection import static_area
+from ssa_nerfstudio.overlay.detection import StaticArea, static_area
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, clipped, composite
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 
@@ -141,18 +141,70 @@ def test_statistics_of_another_frame_are_refused() -> None:
         ScreenSpaceOverlay(12, 8).start_from(statistics)
 
 
-def test_evidence_is_the_deviation_over_its_70th_percentile_where_static_edges_are_and_one_elsewhere() -> None:
+def area_of(opaque: np.ndarray, near: np.ndarray, matte: float, difference: float, light: bool = False) -> StaticArea:
+    """An area that is opaque here, and has a matte and a difference in colour near its edges."""
+    here = torch.from_numpy(near)
+    return StaticArea(
+        inside=here,
+        near=here,
+        opaque=torch.from_numpy(opaque),
+        matte=matte * here.float(),
+        difference=difference * here.float()[..., None].expand(-1, -1, 3),
+        adds_light=light,
+    )
+
+
+def halves(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
+    """Opaque on the left quarter, an artifact on the left half."""
+    opaque, near = np.zeros((2, height, width), bool)
+    opaque[:, : width // 4], near[:, : width // 2] = True, True
+    return opaque, near
+
+
+def test_evidence_is_the_deviation_over_its_70th_percentile_where_opaque_and_one_minus_the_matte_elsewhere() -> None:
     photos, statistics = capture(10, 20)
     overlay = ScreenSpaceOverlay(10, 20)
-    area = static_area(statistics)
-    overlay.start_from(statistics, area)
+    opaque, near = halves(10, 20)
+    overlay.start_from(statistics, area_of(opaque, near, matte=0.3, difference=0.1))
     sigma = (photos / 255).std(axis=0).max(axis=-1)
     reference = np.sort(sigma.ravel())[140 - 1]  # the 140th of 200
-    expected = np.where(area.inside.numpy(), np.minimum(1, sigma / reference), 1)
+    expected = np.minimum(np.where(opaque, np.minimum(1, sigma / reference), 1), np.where(near, 0.7, 1))
     np.testing.assert_allclose(overlay.evidence[..., 0].numpy(), expected, atol=1e-6)
-    assert 0 < area.inside.double().mean() < 1
     assert (overlay.evidence[1:-1, 0] == 0).all(), "pixels whose views agree are spared"
     assert "evidence" not in dict(overlay.named_parameters())
+
+
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_what_the_edges_imply_is_what_the_layers_start_from(resolution: int) -> None:
+    """Mean = T scene + B: with an estimated matte and difference, the scene behind comes out as estimated, too."""
+    photos, statistics = capture(12, 16)
+    mean = photos.mean(axis=0) / 255
+    opaque, near = halves(12, 16)
+    overlay = ScreenSpaceOverlay(12, 16, resolution)
+    overlay.start_from(statistics, area_of(opaque, near, matte=0.3, difference=0.05))
+    transmittance, addition = (layer.detach().numpy() for layer in overlay.layers(resolution))
+    blocks = mean.reshape(12 // resolution, resolution, 16 // resolution, resolution, 3).mean(axis=(1, 3))
+    faint = np.zeros(transmittance.shape[:2], bool)
+    faint[:, 4 // resolution : 8 // resolution] = True
+    np.testing.assert_allclose(transmittance[faint], 0.7, atol=1e-6)
+    np.testing.assert_allclose((blocks - addition)[faint] / 0.7, (blocks - 0.05)[faint], atol=0.01)
+    np.testing.assert_allclose(transmittance[:, 8 // resolution :], 0.99, atol=1e-6)
+    assert (overlay.near[..., 0].numpy() == np.repeat([[1, 0]], 8 // resolution, axis=1)).all()
+
+
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_what_adds_light_starts_from_the_difference_and_hides_only_where_it_is_opaque(resolution: int) -> None:
+    _, statistics = capture(12, 16)
+    opaque, near = halves(12, 16)
+    overlay = ScreenSpaceOverlay(12, 16, resolution, adds_light=True)
+    overlay.start_from(statistics, area_of(opaque, near, matte=0.3, difference=0.2, light=True))
+    matte, light = overlay.matte().detach(), overlay.color().detach()
+    quarter = 4 // resolution
+    torch.testing.assert_close(light[:, quarter : 2 * quarter], torch.full_like(light[:, quarter : 2 * quarter], 0.2))
+    torch.testing.assert_close(light[:, 2 * quarter :], torch.full_like(light[:, 2 * quarter :], 0.01))
+    torch.testing.assert_close(matte[:, quarter:], torch.full_like(matte[:, quarter:], 0.01))
+    assert matte[1:-1, 0].min() > 0.7
+    assert (overlay.evidence[:, quarter:] == 1).all()
 
 
 def test_where_most_pixels_never_change_there_is_no_scale_and_evidence_stays_one() -> None:

@@ -262,6 +262,14 @@ def test_every_schedule_is_scaled_with_the_length_of_the_run():
     assert (full.warmup_length, config.optimizers["means"]["scheduler"].max_steps) == (500, 30_000)
 
 
+@pytest.mark.parametrize(("steps", "factor"), [(30_000, 1), (7_000, 1), (3_500, 2), (1_000, 4), (1, 4)])
+def test_a_short_run_moves_the_overlay_faster(steps, factor):
+    config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    config.max_num_iterations = steps
+    assert scaled(config).optimizers["overlay"]["optimizer"].lr == pytest.approx(factor * 5e-3)
+    assert config.optimizers["overlay"]["optimizer"].lr == 5e-3
+
+
 @pytest.mark.parametrize(
     ("steps", "stated", "between"),
     [(30_000, 5_000, 5_000), (2_000, 5_000, 333), (300, 5_000, 100), (2_000, 50, 50), (2_000, 0, 0)],

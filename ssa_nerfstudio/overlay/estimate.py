@@ -1,0 +1,105 @@
+"""What an artifact looks like, from its edges alone: a matte and a difference in colour before anything is trained.
+
+A photo shows I = T C + B, so that the deviation of the views is T times that of the scene behind, and their mean
+differs from the scene's by B - (1 - T) C. At static edges the gradients of both belong to the artifact, elsewhere to
+the scene. Integrating them where edges are static, and nothing elsewhere, gives log T and that difference
+(gradient-domain reconstruction, as in Perez et al. 2003). A sky or a path that stays in place has no static edges
+around it, and gets 0.
+docs/method.md derives it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from ssa_nerfstudio.overlay.poisson import divergence, integrated
+
+BACKGROUND_SCALE = 2.0
+"""Working pixels (sigma): gradients that vary this slowly along static edges are the scene's, and are subtracted."""
+LEAST_MATTE = 0.1
+"""An estimated matte from which on an artifact is at work. Constant start's matte, too (`layer.CONSTANT_START`)."""
+LEAST_DIFFERENCE = 10 / 255
+"""Difference in colour from which on an artifact is at work."""
+REACH = 32
+"""Working pixels from the nearest static edge beyond which the estimate is nothing: where edges have gaps, it leaks."""
+OPAQUE_STEP = 1.6
+"""Natural logarithm of the ratio of the deviations outside and inside, from which on an area is opaque: a fifth. On
+three captures opaque dashboards and buttons have 2.6 to 4.5, paths and skies between drops at most 0.8."""
+SMALLEST_AREA = 16
+"""Working pixels; a smaller area says nothing of its surroundings."""
+_LEVEL = 1 / 255
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """At the working resolution."""
+
+    matte: np.ndarray
+    """[h, w] in [0, 1]: 1 - T; 0 where there is no more than what comes of noise."""
+    difference: np.ndarray
+    """[3, h, w] in [-1, 1]: mean of the views minus the mean without the artifact, likewise."""
+
+
+def estimate(mean: np.ndarray, deviation: np.ndarray, edges: np.ndarray) -> Estimate:
+    """What the artifact behind static edges looks like.
+
+    Args:
+        mean: of the views, [3, h, w] in [0, 1].
+        deviation: of the views, [h, w].
+        edges: static edges, uint8 [h, w].
+    """
+    within = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= REACH
+    edges = cv2.dilate(edges, _square(3)) > 0
+    matte = 1 - np.exp(np.minimum(_static_part(np.log(deviation + _LEVEL), edges), 0))
+    difference = np.stack([_static_part(channel, edges) for channel in mean])
+    there = (matte > LEAST_MATTE) | (np.abs(difference).max(axis=0) > LEAST_DIFFERENCE)
+    there = cv2.dilate((there & within).astype(np.uint8), _square(3))
+    return Estimate(matte * there, difference * there)
+
+
+def opaque(areas: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Those connected areas behind which nothing shows: the deviation rises at once where they end. uint8 [h, w].
+
+    A path between drops of mud is an area of low deviation among static edges, too; but where it ends, at a drop, the
+    deviation does not rise.
+
+    Args:
+        areas: of low deviation, uint8 [h, w].
+        deviation: of the views, [h, w].
+    """
+    areas = cv2.morphologyEx(areas, cv2.MORPH_CLOSE, _square(3))
+    level = np.log(deviation + _LEVEL)
+    kept = np.zeros_like(areas)
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
+    for label in range(1, count):
+        x, y, w, h, size = boxes[label]
+        if size < SMALLEST_AREA:
+            continue
+        box = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
+        area = (labels[box] == label).astype(np.uint8)
+        outside = cv2.dilate(area, _square(7)) > cv2.dilate(area, _square(3))
+        within = area > cv2.erode(area, _square(5))
+        everything = not outside.any() or not within.any()
+        if everything or np.median(level[box][outside]) - np.median(level[box][within]) >= OPAQUE_STEP:
+            kept[box] |= area
+    return kept
+
+
+def _static_part(image: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """The image [h, w] whose gradients are nearest to this one's at edges, and to 0 elsewhere; its median is 0."""
+    across, down = _above_background(np.diff(image, axis=1)), _above_background(np.diff(image, axis=0))
+    across *= edges[:, 1:] & edges[:, :-1]
+    down *= edges[1:] & edges[:-1]
+    part = integrated(divergence(across, down))
+    return part - np.median(part)
+
+
+def _above_background(gradient: np.ndarray) -> np.ndarray:
+    return gradient - cv2.GaussianBlur(gradient, (0, 0), BACKGROUND_SCALE) if gradient.size else gradient
+
+
+def _square(side: int) -> np.ndarray:
+    return np.ones((side, side), np.uint8)
