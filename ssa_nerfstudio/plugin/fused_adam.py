@@ -30,11 +30,15 @@ class FusedAdam(torch.optim.Adam):
 
     refused: Tensor | None = None
     """One number on the device: where it is 1, a step changes nothing. None: every step is taken."""
-    taken: Tensor | None = None
-    """1 - refused."""
+    counted: bool = False
+    """Whether the next step is counted already, with those of other optimisers in one kernel (`counters`)."""
 
     def __init__(self, params: Any, **settings: Any) -> None:
         super().__init__(params, fused=True, **settings)
+
+    def counters(self) -> list[Tensor]:
+        """The numbers of steps, on the device, of the parameters that have a gradient."""
+        return [self._of(p)["step"] for group in self.param_groups for p in group["params"] if p.grad is not None]
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -45,24 +49,24 @@ class FusedAdam(torch.optim.Adam):
         """
         scale: Tensor | None = getattr(self, "grad_scale", None)
         overflow: Tensor | None = getattr(self, "found_inf", None)  # both are a GradScaler's
-        refused, taken = self.refused, self.taken
+        refused = self.refused
         if overflow is not None:
             refused = overflow if refused is None else torch.maximum(overflow, refused)
-            taken = 1 - refused
+        if not self.counted:
+            count_steps(self.counters(), None if refused is None else 1 - refused)
+        self.counted = False
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
             if not parameters:
                 continue
-            states = [self.state[p] or self._begin(p) for p in parameters]
-            steps = [state["step"] for state in states]
-            torch._foreach_add_(steps, 1 if taken is None else taken.reshape(()))  # pyright: ignore[reportPrivateImportUsage]
+            states = [self._of(p) for p in parameters]
             torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
                 parameters,
                 [p.grad for p in parameters],
                 [state["exp_avg"] for state in states],
                 [state["exp_avg_sq"] for state in states],
                 [],
-                steps,
+                [state["step"] for state in states],
                 lr=group["lr"],
                 beta1=group["betas"][0],
                 beta2=group["betas"][1],
@@ -74,10 +78,20 @@ class FusedAdam(torch.optim.Adam):
                 found_inf=refused,
             )
 
-    def _begin(self, parameter: Tensor) -> dict[str, Tensor]:
-        self.state[parameter] = {
-            "step": torch.zeros((), dtype=torch.float32, device=parameter.device),
-            "exp_avg": torch.zeros_like(parameter, memory_format=torch.preserve_format),
-            "exp_avg_sq": torch.zeros_like(parameter, memory_format=torch.preserve_format),
-        }
-        return self.state[parameter]
+    def _of(self, parameter: Tensor) -> dict[str, Tensor]:
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
+            state["exp_avg"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+            state["exp_avg_sq"] = torch.zeros_like(parameter, memory_format=torch.preserve_format)
+        return state
+
+
+def count_steps(counters: list[Tensor], taken: Tensor | None) -> None:
+    """Add 1 to numbers of steps, or what is `taken` [], on the device; in one kernel.
+
+    A list of it, because torch would read a tensor without dimensions from the device to use it as a number.
+    """
+    if counters:
+        more = 1 if taken is None else [taken.reshape(())] * len(counters)
+        torch._foreach_add_(counters, more)  # pyright: ignore[reportPrivateImportUsage]

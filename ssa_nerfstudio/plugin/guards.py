@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from ssa_nerfstudio.errors import give_up, warn
-from ssa_nerfstudio.plugin.fused_adam import FusedAdam
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam, count_steps
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 READ_EVERY = 100
@@ -81,20 +81,22 @@ class StepGuard:
         search(norms, self.skipped, self._one)
         self.taken = 1 - self.skipped
         self._noted.append((names, norms))
+        fused = [optimizer for optimizer in optimizers.values() if isinstance(optimizer, FusedAdam)]
+        count_steps([counter for optimizer in fused for counter in optimizer.counters()], self.taken)
+        for optimizer in fused:
+            optimizer.refused, optimizer.counted = self.skipped, True
 
     def watch(self, optimizer: torch.optim.Optimizer) -> None:
         """Let an optimiser take no step that was judged to be skipped."""
-        optimizer.register_step_pre_hook(self._before_step)
         if not isinstance(optimizer, FusedAdam):
+            optimizer.register_step_pre_hook(self._before_step)
             optimizer.register_step_post_hook(_forget)
 
     def _before_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
-        """Fused optimisers are told on the device, for others the host has to ask."""
+        """torch's fused optimisers are told on the device, for others the host has to ask."""
         if self.skipped is None:
             return
-        if isinstance(optimizer, FusedAdam):
-            optimizer.refused, optimizer.taken = self.skipped, self.taken
-        elif getattr(optimizer, "_step_supports_amp_scaling", False):
+        if getattr(optimizer, "_step_supports_amp_scaling", False):
             scalers = getattr(optimizer, "found_inf", None)  # a GradScaler has found something of its own
             if scalers is None:
                 optimizer.found_inf = self.skipped  # pyright: ignore[reportAttributeAccessIssue]

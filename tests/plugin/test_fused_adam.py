@@ -8,7 +8,7 @@ import pytest
 import torch
 from gsplat.strategy.ops import _update_param_with_optimizer
 
-from ssa_nerfstudio.plugin.fused_adam import FusedAdam, FusedAdamConfig
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam, FusedAdamConfig, count_steps
 
 
 def two(lr: float = 0.1, **settings) -> tuple[list[torch.nn.Parameter], list[torch.optim.Optimizer]]:
@@ -37,7 +37,7 @@ def test_a_refused_step_changes_nothing_and_the_next_is_as_if_it_had_not_been() 
     assert isinstance(optimizer, FusedAdam)
     for value, refused in ((1.0, 0.0), (float("nan"), 1.0), (0.5, 0.0)):
         ours.grad = torch.full((3, 4), value)
-        optimizer.refused, optimizer.taken = torch.tensor(refused), torch.tensor(1 - refused)
+        optimizer.refused = torch.tensor(refused)
         before = copy.deepcopy([ours.detach(), *optimizer.state[ours].values()])
         optimizer.step()
         if refused:
@@ -46,6 +46,23 @@ def test_a_refused_step_changes_nothing_and_the_next_is_as_if_it_had_not_been() 
             torchs.grad = torch.full((3, 4), value)
             plain.step()
     assert torch.equal(ours, torchs)
+
+
+def test_steps_that_are_counted_together_are_not_counted_again() -> None:
+    parameters = [torch.nn.Parameter(torch.zeros(2)) for _ in range(3)]
+    optimizers = [FusedAdam([parameter], lr=0.1) for parameter in parameters]
+    for parameter in parameters[:2]:
+        parameter.grad = torch.ones(2)
+    count_steps([counter for optimizer in optimizers for counter in optimizer.counters()], torch.tensor(1.0))
+    for optimizer in optimizers[:2]:
+        optimizer.counted = True
+        optimizer.step()
+        optimizer.step()
+    assert [float(optimizer.state[p]["step"]) for p, optimizer in zip(parameters[:2], optimizers, strict=False)] == [
+        2,
+        2,
+    ]
+    assert parameters[2] not in optimizers[2].state
 
 
 def test_states_are_exchanged_with_torchs() -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
+from collections import Counter
 
 import pytest
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
 from ssa_nerfstudio.benchmark.run import configure
@@ -91,6 +93,43 @@ def test_a_step_that_is_not_finite_leaves_everything_as_it_was(tiny_scene, tmp_p
     moved = [name for name in before if not torch.equal(after[name], states[3][name])]
     assert {"_model.gauss_params.means", "means.0.exp_avg", "means.0.step", "grad2d", "count"} <= set(moved)
     assert first_not_finite(states[3]) is None
+
+
+class Operations(TorchDispatchMode):
+    """Counts what torch does."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: Counter[str] = Counter()
+
+    def __torch_dispatch__(self, operation, types, arguments=(), settings=None):
+        self.counts[operation.overloadpacket.__name__] += 1
+        return operation(*arguments, **(settings or {}))
+
+
+@OVERLAYS
+@pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
+def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_path, overlay, method):
+    """Between two looks: reading one number (`_local_scalar_dense`) would make the host wait at every step."""
+    counts: dict[bool, Counter[str]] = {}
+    for guards in (True, False):
+        trainer = make(tiny_scene, tmp_path / str(guards), steps=8, method=method, overlay=overlay, guards=guards)
+        trainer.pipeline.train()
+        for step in (0, 1, 2):
+            with Operations() as operations:
+                for location in TrainingCallbackLocation:
+                    if location is TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
+                        trainer.train_iteration(step)
+                    if location is not TrainingCallbackLocation.AFTER_TRAIN:
+                        for callback in trainer.callbacks:
+                            callback.run_callback_at_location(step, location)
+        counts[guards] = operations.counts
+    more = counts[True] - counts[False]
+    assert more["_local_scalar_dense"] == 0
+    assert more["item"] == 0
+    launched = more.total() - more["view"] - more["detach"] - more["alias"]
+    fewer = counts[False] - counts[True]
+    assert launched - fewer.total() <= 4
 
 
 @OVERLAYS
