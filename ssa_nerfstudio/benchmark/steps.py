@@ -20,6 +20,8 @@ from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
+from ssa_nerfstudio.benchmark.run import METHODS
+
 FIRST, LAST = 599, 999
 """Steps between which the time is taken: after Triton's compilation and the first refinements."""
 
@@ -37,7 +39,7 @@ class Command:
 
     def run(self) -> None:
         """Train 1000 steps and print one line."""
-        config = copy.deepcopy(all_methods[self.method])
+        config = copy.deepcopy((all_methods | METHODS)[self.method])
         config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", LAST + 1, 10 * LAST
         config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
         config.logging.local_writer.enable = False

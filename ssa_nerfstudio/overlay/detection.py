@@ -309,10 +309,11 @@ def _area(statistics: ImageStatistics, edges: np.ndarray) -> tuple[StaticArea, f
     low = _low(deviation)
     plain = _supported(low.astype(np.uint8), cv2.dilate(edges, _AROUND, iterations=2))
     mean = _at_working_size(statistics.mean(), statistics)
-    looks = estimate(mean, deviation, edges)
+    hidden = opaque(plain | (edges & low), deviation)
+    looks = estimate(mean, deviation, edges, hidden)
     distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     near = (distance <= NEAR) | (looks.matte > 0) | looks.difference.any(axis=0)
-    masks = cv2.dilate(edges, _AROUND) | plain, near.astype(np.uint8), opaque(plain | (edges & low), deviation)
+    masks = cv2.dilate(edges, _AROUND) | plain, near.astype(np.uint8), hidden
     inside, near, hidden = (_at_full_size(mask, statistics) > 0 for mask in masks)
     area = StaticArea(
         inside=inside,

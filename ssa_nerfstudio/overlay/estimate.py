@@ -43,14 +43,17 @@ class Estimate:
     """[3, h, w] in [-1, 1]: mean of the views minus the mean without the artifact, likewise."""
 
 
-def estimate(mean: np.ndarray, deviation: np.ndarray, edges: np.ndarray) -> Estimate:
-    """What the artifact behind static edges looks like.
+def estimate(mean: np.ndarray, deviation: np.ndarray, edges: np.ndarray, hidden: np.ndarray) -> Estimate:
+    """What the artifact behind static edges looks like, where it is not opaque.
 
     Args:
         mean: of the views, [3, h, w] in [0, 1].
         deviation: of the views, [h, w].
         edges: static edges, uint8 [h, w].
+        hidden: what is `opaque`, uint8 [h, w]. Its edges are left out: log T is beyond measure behind them, and through
+            a gap in such an outline it would leak.
     """
+    edges = edges * (cv2.dilate(hidden, _square(7)) == 0)
     within = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) <= REACH
     edges = cv2.dilate(edges, _square(3)) > 0
     matte = 1 - np.exp(np.minimum(_static_part(np.log(deviation + _LEVEL), edges), 0))

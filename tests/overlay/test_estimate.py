@@ -33,7 +33,7 @@ def test_matte_and_difference_of_a_logo_come_from_its_outline(alpha: float) -> N
     """The unknown scene behind varies slowly: the estimate keeps half of the logo, and drops the scene."""
     matte = alpha * logo()
     mean, deviation, edges = seen(matte, color=1.0)
-    found = estimate(mean, deviation, edges)
+    found = estimate(mean, deviation, edges, 0 * edges)
     clean = seen(0 * matte, color=1.0)[0]
     inside, outside = logo() & (edges == 0), ~logo() & (edges == 0)
     assert 0.4 * alpha < np.median(found.matte[inside]) < 1.05 * alpha
@@ -47,7 +47,7 @@ def test_what_stays_in_place_without_static_edges_is_nothing() -> None:
     """A sky above a skyline: mean and deviation have a border there, but no static edge."""
     mean, deviation, edges = seen(0.4 * logo(), color=1.0)
     mean[:, :10], deviation[:10] = 0.9, 0.001
-    found = estimate(mean, deviation, edges)
+    found = estimate(mean, deviation, edges, 0 * edges)
     assert not found.matte[:9].any()
     assert not found.difference[:, :9].any()
 
@@ -66,20 +66,31 @@ def test_opaque_is_where_the_deviation_rises_at_the_border() -> None:
     assert opaque(np.ones_like(board), 0 * deviation).all(), "of a frame without a border there is nothing else to say"
 
 
+def test_an_opaque_board_leaks_nothing_through_a_gap_in_its_outline() -> None:
+    matte = np.zeros((HEIGHT, WIDTH))
+    matte[70:] = 1
+    mean, deviation, edges = seen(matte, color=0.1)
+    edges[:, 50:60] = 0
+    assert estimate(mean, deviation, edges, 0 * edges).matte[:60].any()
+    found = estimate(mean, deviation, edges, opaque((matte > 0).astype(np.uint8), deviation))
+    assert not found.matte.any()
+    assert not found.difference.any()
+
+
 @settings(max_examples=25, deadline=None)
 @given(height=st.integers(1, 40), width=st.integers(1, 40), seed=st.integers(0, 100))
 def test_any_frame_gives_finite_layers_of_its_size(height: int, width: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     mean, deviation = rng.random((3, height, width)), 0.5 * rng.random((height, width))
     edges = (rng.random((height, width)) < 0.2).astype(np.uint8)
-    found = estimate(mean, deviation, edges)
+    found = estimate(mean, deviation, edges, 0 * edges)
     assert found.matte.shape == (height, width)
     assert found.difference.shape == (3, height, width)
     assert np.isfinite(found.difference).all()
     assert found.matte.min() >= 0
     assert found.matte.max() <= 1
     assert opaque(edges, deviation).shape == (height, width)
-    empty = estimate(mean, deviation, 0 * edges)
+    empty = estimate(mean, deviation, 0 * edges, edges)
     assert not empty.matte.any()
     assert not empty.difference.any()
 
@@ -94,7 +105,7 @@ def test_far_from_edges_the_estimate_is_nothing_though_it_leaks() -> None:
     )
     edges = np.pad(edges, ((0, 0), (0, wide)))
     edges[:, 70:] = 0
-    found = estimate(mean, deviation, edges)
+    found = estimate(mean, deviation, edges, 0 * edges)
     assert not found.matte[:, 70 + REACH + 2 :].any()
     assert not found.difference[:, :, 70 + REACH + 2 :].any()
     assert found.matte[:, :70].any()
