@@ -18,6 +18,8 @@ COMMANDS = {
     "tradeoff": "What accuracy costs in time: one knob at a time and a few together, with frontier and knee.",
 }
 """Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""
+INTERRUPTED = 130
+"""Exit code after ctrl+c: what shells give a command that the signal ended."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -43,8 +45,12 @@ def main(arguments: list[str] | None = None) -> None:
     from ssa_nerfstudio.cli import arguments as options
 
     warnings.simplefilter("ignore", FutureWarning)  # libraries' own, at import: nothing that a user could act on
-    command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
-    options.read(command, rest, f"ssa {name}", COMMANDS[name]).run()
+    try:
+        command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+        options.read(command, rest, f"ssa {name}", COMMANDS[name]).run()
+    except KeyboardInterrupt:
+        print(f"ssa {name} was stopped", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
 
 
 def _usage() -> str:

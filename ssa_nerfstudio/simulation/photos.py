@@ -31,7 +31,7 @@ def read_photo(path: Path, width: int, height: int) -> np.ndarray:
     try:
         with Image.open(path) as image:
             image.load()
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise UnusableFile(
             f"{path} cannot be read as a photo ({error}); copy it again from its source or remove its frame"
         ) from error

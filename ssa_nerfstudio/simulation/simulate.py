@@ -70,7 +70,11 @@ def _check_names(names: dict[str, str]) -> None:
 
 
 def _copy(source: Path, target: Path) -> None:
-    if not source.is_file():
-        raise UnusableFile(f"{source} does not exist; put it there or remove it from transforms.json")
+    try:
+        content = source.open("rb")
+    except OSError as error:
+        what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+        raise UnusableFile(f"{source} {what}; put it there or remove it from transforms.json") from error
     target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(source, target)
+    with content, target.open("wb") as file:
+        shutil.copyfileobj(content, file)

@@ -195,7 +195,7 @@ def test_grey_and_opaque_rgba_photos_are_taken_as_rgb(tmp_path):
         assert np.abs(pixels(tmp_path / "out" / name) - exact(layers, pixels(data / name))).max() <= 0.5 + 1e-3
 
 
-def test_an_interrupted_run_leaves_nothing(tmp_path, monkeypatch):
+def test_an_interrupted_run_leaves_nothing(tmp_path, monkeypatch, capsys):
     data = write_dataset(tmp_path / "data")
     written = []
 
@@ -206,9 +206,30 @@ def test_an_interrupted_run_leaves_nothing(tmp_path, monkeypatch):
         write_photo(path, image)
 
     monkeypatch.setattr(corruption, "write_photo", interrupted)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(SystemExit) as stopped:
         run(data, tmp_path / "out", "--effects", "vignette")
+    assert stopped.value.code == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "ssa simulate was stopped"
     assert [path.name for path in tmp_path.iterdir()] == ["data"]
+
+
+def test_a_file_that_cannot_be_copied_is_named_and_not_the_output(tmp_path, capsys):
+    data = write_dataset(tmp_path / "data")
+    points = data / "sparse_pc.ply"
+    points.unlink()
+    points.mkdir()
+    with pytest.raises(SystemExit):
+        run(data, tmp_path / "out", "--effects", "vignette")
+    assert f"{points} cannot be read (Is a directory)" in capsys.readouterr().err
+
+
+def test_a_photo_too_large_to_be_one_is_named(tmp_path, capsys, monkeypatch):
+    data = write_dataset(tmp_path / "data")
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 10)
+    with pytest.raises(SystemExit):
+        run(data, tmp_path / "out", "--effects", "vignette")
+    assert "cannot be read as a photo (Image size" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_killed_run_leaves_nothing_that_looks_complete(tmp_path):
