@@ -21,7 +21,7 @@ import torch
 from scipy.special import betaincinv
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.estimate import estimate, opaque
+from ssa_nerfstudio.overlay.estimate import estimate, opaque, textured
 from ssa_nerfstudio.overlay.formation import adds_light
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
@@ -74,7 +74,7 @@ class StaticArea:
     near: Tensor
     """[H, W] bool: that, all within NEAR working pixels of a static edge, and what the edges imply."""
     opaque: Tensor
-    """[H, W] bool: where nothing shows through (`estimate.opaque`)."""
+    """[H, W] bool: where nothing or little shows through (`estimate.opaque`, `estimate.textured`)."""
     matte: Tensor
     """[H, W] in [0, 1], as the edges imply it (`estimate.estimate`)."""
     difference: Tensor
@@ -313,6 +313,9 @@ def _area(statistics: ImageStatistics, edges: np.ndarray) -> tuple[StaticArea, f
     looks = estimate(mean, deviation, edges, hidden)
     distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     near = (distance <= NEAR) | (looks.matte > 0) | looks.difference.any(axis=0)
+    light = adds_light(mean.mean(axis=0), deviation, (edges > 0) & ~low)
+    if not light:
+        hidden |= textured(edges, deviation)
     masks = cv2.dilate(edges, _AROUND) | plain, near.astype(np.uint8), hidden
     inside, near, hidden = (_at_full_size(mask, statistics) > 0 for mask in masks)
     area = StaticArea(
@@ -321,7 +324,7 @@ def _area(statistics: ImageStatistics, edges: np.ndarray) -> tuple[StaticArea, f
         opaque=hidden,
         matte=_at_full_size(looks.matte, statistics),
         difference=torch.stack([_at_full_size(channel, statistics) for channel in looks.difference], dim=-1),
-        adds_light=adds_light(mean.mean(axis=0), deviation, (edges > 0) & ~low),
+        adds_light=light,
     )
     return area, float((plain | (edges & low)).mean())
 

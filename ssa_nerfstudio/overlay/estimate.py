@@ -28,6 +28,12 @@ REACH = 32
 OPAQUE_STEP = 1.6
 """Natural logarithm of the ratio of the deviations outside and inside, from which on an area is opaque: a fifth. On
 three captures opaque dashboards and buttons have 2.6 to 4.5, paths and skies between drops at most 0.8."""
+TEXTURED_SHARE = 0.2
+"""Share of static edges in a window, from which on what is there has a texture of its own ..."""
+TEXTURE_WINDOW = 9
+"""... side of the window, working pixels ..."""
+TEXTURED_DEVIATION = 0.5
+"""... if the deviation is below this share of the frame's (its 75th percentile)."""
 SMALLEST_AREA = 16
 """Working pixels; a smaller area says nothing of its surroundings."""
 _LEVEL = 1 / 255
@@ -89,6 +95,21 @@ def opaque(areas: np.ndarray, deviation: np.ndarray) -> np.ndarray:
         if everything or np.median(level[box][outside]) - np.median(level[box][within]) >= OPAQUE_STEP:
             kept[box] |= area
     return kept
+
+
+def textured(edges: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+    """Where an artifact has a texture of its own and hides much: dense static edges, low deviation. uint8 [h, w].
+
+    A bonnet that mirrors the passing scene; its deviation does not rise fivefold where it ends. A path behind drops of
+    mud looks the same, but for what it is behind; bonnets are more frequent.
+
+    Args:
+        edges: static edges, uint8 [h, w].
+        deviation: of the views, [h, w].
+    """
+    dense = cv2.blur(edges.astype(np.float32), (TEXTURE_WINDOW, TEXTURE_WINDOW)) >= TEXTURED_SHARE
+    calm = deviation < TEXTURED_DEVIATION * np.quantile(deviation, 0.75)
+    return cv2.morphologyEx((dense & calm).astype(np.uint8), cv2.MORPH_CLOSE, _square(3))
 
 
 def _static_part(image: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -261,7 +261,7 @@ def _evidence(deviation: Tensor, opaque: Tensor) -> Tensor:
     """r: how much the sparsity weighs on a pixel, 1 where nothing is opaque (its share of the pixel).
 
     There, r = min(1, sigma / 70th percentile of sigma), near 0 where the views agree, so that sparsity spares what an
-    artifact hides. A sky agrees with itself, too; but its deviation does not rise where it ends, and sparsity weighs.
+    artifact hides. A sky agrees with itself, too; but it is not taken for opaque, and sparsity weighs.
     """
     values = deviation.flatten().float()
     rank = max(1, round(0.7 * values.numel()))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.overlay.estimate import REACH, estimate, opaque
+from ssa_nerfstudio.overlay.estimate import REACH, estimate, opaque, textured
 
 HEIGHT, WIDTH = 96, 128
 
@@ -109,3 +109,15 @@ def test_far_from_edges_the_estimate_is_nothing_though_it_leaks() -> None:
     assert not found.matte[:, 70 + REACH + 2 :].any()
     assert not found.difference[:, :, 70 + REACH + 2 :].any()
     assert found.matte[:, :70].any()
+
+
+def test_a_calm_area_with_a_texture_of_its_own_is_told_from_one_that_changes() -> None:
+    """A bonnet below; an equally dense texture above, where the scene changes behind it."""
+    rng = np.random.default_rng(4)
+    edges = np.zeros((HEIGHT, WIDTH), np.uint8)
+    edges[80:], edges[:20] = rng.random((16, WIDTH)) < 0.4, rng.random((20, WIDTH)) < 0.4
+    deviation = np.full((HEIGHT, WIDTH), 0.2)
+    deviation[78:] = 0.05
+    found = textured(edges, deviation)
+    assert found[82:].mean() > 0.95
+    assert not found[:70].any()

@@ -180,9 +180,9 @@ def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path
     photos = pipeline.datamanager.cached_train
     deviation = accumulate((photo["image"], None) for photo in photos).deviation()
     expected = torch.exp(-deviation / 0.05).clamp(0.01, 0.99).float()
-    # One step of Adam moves every logit by 0.005.
+    # One step of Adam moves every logit by the learning rate, which a run as short as this has four times as high.
     drift = pipeline.model.artifacts.learned()[0].alpha_logits.detach() - expected.logit()
-    assert drift.abs().max() < 0.0051
+    assert drift.abs().max() < 4 * 0.0051
 
 
 def test_light_in_front_of_the_photos_is_recognised_learned_and_reloaded(broken_scene, tmp_path):
