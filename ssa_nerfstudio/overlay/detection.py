@@ -21,8 +21,7 @@ import torch
 from scipy.special import betaincinv
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.estimate import estimate, opaque, textured
-from ssa_nerfstudio.overlay.formation import adds_light
+from ssa_nerfstudio.overlay.area import HALF_A_GREY_LEVEL, EnclosedAreas, StaticArea
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
 DRAWS = 200
@@ -50,42 +49,11 @@ SIGNIFICANCE = 0.01
 """Largest p-value that is reported as an artifact."""
 LEAST_VIEWS = 6
 """With fewer views than this, standard errors mean nothing and nothing is reported."""
-LOW_DEVIATION = 0.2
-"""Deviation relative to the capture's (its 75th percentile) below which a pixel can be behind an opaque artifact."""
-HALF_A_GREY_LEVEL = 0.5 / 255
-"""Deviations below this are low in any capture, and tell of no displacement."""
 CLIPPED = 1.5 / 255
 """Colours this near to black or white in all channels say nothing: whatever exceeds the range looks constant."""
 OPAQUE_SHARE = 0.25
 """Share of the artifact's area that has to be opaque for that verdict."""
-NEAR = 16
-"""Working pixels around a static edge in which its artifact may go on: thin mud, drops whose edges were missed."""
-EDGE_SUPPORT = 0.5
-"""Share of an area's outline that has to be static edges: a plain artifact has them all around, a plain sky has not."""
 _AROUND = np.ones((3, 3), np.uint8)
-
-
-@dataclass(frozen=True)
-class StaticArea:
-    """Where an artifact would be, whatever the verdict, and what it looks like: what an overlay starts from."""
-
-    inside: Tensor
-    """[H, W] bool: static edges, and plain areas among them."""
-    near: Tensor
-    """[H, W] bool: that, all within NEAR working pixels of a static edge, and what the edges imply."""
-    opaque: Tensor
-    """[H, W] bool: where nothing or little shows through (`estimate.opaque`, `estimate.textured`)."""
-    matte: Tensor
-    """[H, W] in [0, 1], as the edges imply it (`estimate.estimate`)."""
-    difference: Tensor
-    """[H, W, 3] in [-1, 1]: mean of the views minus the mean without the artifact, likewise."""
-    adds_light: bool
-    """The artifact shines and hides nothing (`formation.adds_light`)."""
-
-    @classmethod
-    def plain(cls, constant: Tensor) -> StaticArea:
-        """Opaque where `constant` [H, W], and nothing elsewhere; without edges that say more."""
-        return cls(constant, constant, constant, torch.zeros(constant.shape), torch.zeros(*constant.shape, 3), False)
 
 
 @dataclass(frozen=True)
@@ -143,11 +111,12 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
     fine, coarse = (float(np.mean(scale)) for scale in zip(*null, strict=True))
     excess = shares[0] - fine, shares[1] - coarse
     interval = _interval(reached, draws)
-    area, opaque_share = _area(statistics, _edges(fields, still))
-    if p_value > SIGNIFICANCE or (_strength(excess) < 1 and opaque_share < LEAST_PLAIN):
+    enclosed = EnclosedAreas.by(_edges(fields, still), statistics)
+    if p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < LEAST_PLAIN):
         return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere)
+    area = enclosed.area()
     coverage = float(area.inside.float().mean())
-    verdict = "opaque" if opaque_share >= OPAQUE_SHARE * coverage else "faint"
+    verdict = "opaque" if enclosed.opaque_share >= OPAQUE_SHARE * coverage else "faint"
     return Detection(verdict, coverage, p_value, interval, views, shares, (fine, coarse), evidence, area)
 
 
@@ -161,14 +130,14 @@ def static_area(statistics: ImageStatistics) -> StaticArea:
         return StaticArea.plain(torch.ones(statistics.size, dtype=torch.bool))
     moments, still = _look(statistics)
     fields = [_evidence(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments]
-    area, opaque_share = _area(statistics, _edges(fields, still))
-    if _strength(_shares(fields, still)) < 1 and opaque_share < LEAST_PLAIN:
+    enclosed = EnclosedAreas.by(_edges(fields, still), statistics)
+    if _strength(_shares(fields, still)) < 1 and enclosed.opaque_share < LEAST_PLAIN:
         mean, deviation = statistics.mean(), statistics.deviation()
         constant = deviation[..., 0] < HALF_A_GREY_LEVEL
         if not constant.all():
             constant &= ~((mean < CLIPPED).all(dim=-1) | (mean > 1 - CLIPPED).all(dim=-1))
         return StaticArea.plain(constant.cpu())
-    return area
+    return enclosed.area()
 
 
 def _nowhere(statistics: ImageStatistics) -> StaticArea:
@@ -303,32 +272,6 @@ def _interval(reached: int, draws: int) -> tuple[float, float]:
     return low, high
 
 
-def _area(statistics: ImageStatistics, edges: np.ndarray) -> tuple[StaticArea, float]:
-    """Edges [h, w], widened, and the areas of low deviation among them; and the share of the frame that is opaque."""
-    deviation = _deviation(statistics)
-    low = _low(deviation)
-    plain = _supported(low.astype(np.uint8), cv2.dilate(edges, _AROUND, iterations=2))
-    mean = _at_working_size(statistics.mean(), statistics)
-    hidden = opaque(plain | (edges & low), deviation)
-    looks = estimate(mean, deviation, edges, hidden)
-    distance = cv2.distanceTransform(1 - edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    near = (distance <= NEAR) | (looks.matte > 0) | looks.difference.any(axis=0)
-    light = adds_light(mean.mean(axis=0), deviation, (edges > 0) & ~low)
-    if not light:
-        hidden |= textured(edges, deviation)
-    masks = cv2.dilate(edges, _AROUND) | plain, near.astype(np.uint8), hidden
-    inside, near, hidden = (_at_full_size(mask, statistics) > 0 for mask in masks)
-    area = StaticArea(
-        inside=inside,
-        near=inside | near,
-        opaque=hidden,
-        matte=_at_full_size(looks.matte, statistics),
-        difference=torch.stack([_at_full_size(channel, statistics) for channel in looks.difference], dim=-1),
-        adds_light=light,
-    )
-    return area, float((plain | (edges & low)).mean())
-
-
 def _edges(fields: list[Tensor], still: list[Tensor]) -> np.ndarray:
     """The artifact's edges at the working resolution, uint8 [h, w]: coarse ones where there are too few fine ones."""
     h, w = fields[0].shape
@@ -339,52 +282,9 @@ def _edges(fields: list[Tensor], still: list[Tensor]) -> np.ndarray:
     return fine if fine.mean() >= LEAST_SHARES[0] else np.kron(coarse, np.ones((COARSE, COARSE), np.uint8))[:h, :w]
 
 
-def _low(deviation: np.ndarray) -> np.ndarray:
-    """Where the views agree so far that an opaque artifact may be the reason, bool [h, w]."""
-    return deviation < max(LOW_DEVIATION * np.quantile(deviation, 0.75), HALF_A_GREY_LEVEL)
-
-
-def _deviation(statistics: ImageStatistics) -> np.ndarray:
-    return _at_working_size(statistics.deviation(), statistics)[0]
-
-
-def _at_working_size(layer: Tensor, statistics: ImageStatistics) -> np.ndarray:
-    """A layer [H, W, C] of the frame as [C, h, w]; rows and columns that fill no block are dropped."""
-    reduction = statistics.brightness.reduction
-    h, w = (side // reduction for side in statistics.size)
-    planes = layer[: h * reduction, : w * reduction].permute(2, 0, 1)[None].float()
-    return nn.functional.avg_pool2d(planes, reduction)[0].cpu().numpy()
-
-
-def _at_full_size(layer: np.ndarray, statistics: ImageStatistics) -> Tensor:
-    """A layer [h, w] at the working resolution as [H, W]: bytes by repetition, others linearly."""
-    height, width = statistics.size
-    reduction = statistics.brightness.reduction
-    way = cv2.INTER_NEAREST if layer.dtype == np.uint8 else cv2.INTER_LINEAR
-    enlarged = cv2.resize(layer, None, fx=reduction, fy=reduction, interpolation=way)
-    missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]))
-    return torch.from_numpy(np.pad(enlarged, missing, mode="edge"))
-
-
 def _settled(edges: np.ndarray, still: np.ndarray) -> np.ndarray:
     """Those connected edges of which a share of STILL_SHARE does not move: uint8 [h, w]."""
     count, labels = cv2.connectedComponents(cv2.dilate(edges, _AROUND))
     total = np.bincount(labels[edges > 0], minlength=count)
     unmoved = np.bincount(labels[(edges > 0) & still], minlength=count)
     return edges * (unmoved >= STILL_SHARE * total)[np.asarray(labels, np.int32)]
-
-
-def _supported(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Those connected areas whose outline is made of edges for a share of EDGE_SUPPORT: uint8 [h, w]."""
-    supported = np.zeros_like(areas)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
-    for label in range(1, count):
-        x, y, w, h, size = boxes[label]
-        if size < COARSE**2:
-            continue
-        box = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        inside = (labels[box] == label).astype(np.uint8)
-        outline = cv2.dilate(inside, _AROUND) > inside
-        if not outline.any() or edges[box][outline].mean() >= EDGE_SUPPORT:
-            supported[box] |= inside
-    return supported

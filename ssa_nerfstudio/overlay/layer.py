@@ -10,7 +10,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.detection import StaticArea
+from ssa_nerfstudio.overlay.area import StaticArea
 from ssa_nerfstudio.overlay.resampling import (
     letterbox,
     reduced_size,

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from nerfstudio.models.splatfacto import resize_image
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.detection import StaticArea, static_area
+from ssa_nerfstudio.overlay.area import StaticArea
+from ssa_nerfstudio.overlay.detection import static_area
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, clipped, composite
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 
