@@ -290,10 +290,9 @@ def _require_alive(model: SSASplatfactoModel, cause: Exception | None = None) ->
 
 def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
     """Settings of the model by field name, from name=value."""
-    model = {name: yaml.safe_load(value) for name, value in (setting.split("=", 1) for setting in settings)}
+    pairs = (setting.split("=", 1) for setting in settings)
     # YAML reads on and off as booleans.
-    if isinstance(model.get("overlay"), bool):
-        model["overlay"] = "on" if model["overlay"] else "off"
+    model = {name: value if value in ("on", "off") else yaml.safe_load(value) for name, value in pairs}
     if "overlay_given" in model:
         model["overlay_given"] = Path(model["overlay_given"])
     return model
