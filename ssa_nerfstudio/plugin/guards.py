@@ -55,7 +55,8 @@ class StepGuard:
         """1 - skipped."""
         self._optimizers: Mapping[str, torch.optim.Optimizer] = {}
         self._skips: list[Tensor] = []
-        self._noted: list[tuple[list[str], Sequence[Tensor]]] = []
+        self._noted: list[tuple[int, list[bool], Sequence[Tensor]]] = []
+        """Of each step: how many terms the loss had, which parameters had a gradient, and the norms of all of them."""
         self._row, self._row_began, self._culprits = 0, 0, ""
 
     def judge(self, losses: Sequence[Tensor], optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
@@ -69,18 +70,16 @@ class StepGuard:
             self._skips += losses[0].new_zeros(READ_EVERY, dtype=torch.float32).unbind()
             self._one = losses[0].new_ones((), dtype=torch.float32)
         self._optimizers = optimizers
-        names, values = [THE_LOSS] * len(losses), list(losses)
-        for name, parameter in _parameters(optimizers):
-            if parameter.grad is not None:
-                names.append(name)
-                values.append(parameter.grad)
+        # Not from a list of old: densification puts new parameters into the optimisers. Names are found where needed.
+        gradients = [p.grad for o in optimizers.values() for group in o.param_groups for p in group["params"]]
+        values = [*losses, *(gradient for gradient in gradients if gradient is not None)]
         norms = torch._foreach_norm(values)  # pyright: ignore[reportPrivateImportUsage]
         self.skipped = self._skips[len(self._noted)]
         # Sets `skipped` to 1 where a norm is not finite; multiplies the norms by one.
         search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
         search(norms, self.skipped, self._one)
         self.taken = 1 - self.skipped
-        self._noted.append((names, norms))
+        self._noted.append((len(losses), [gradient is not None for gradient in gradients], norms))
         fused = [optimizer for optimizer in optimizers.values() if isinstance(optimizer, FusedAdam)]
         count_steps([counter for optimizer in fused for counter in optimizer.counters()], self.taken)
         for optimizer in fused:
@@ -117,12 +116,12 @@ class StepGuard:
         skips = torch.stack(self._skips[: len(noted)]).tolist() if noted else []
         self._skips = []
         skipped = int(sum(skips))
-        for at, (skip, (names, norms)) in enumerate(zip(skips, noted, strict=True), start=step + 1 - len(noted)):
+        for at, (skip, of_step) in enumerate(zip(skips, noted, strict=True), start=step + 1 - len(noted)):
             if not skip:
                 self._row = 0
                 continue
             if self._row == 0:
-                self._row_began, self._culprits = at, self._described(names, norms)
+                self._row_began, self._culprits = at, self._described(*of_step)
             self._row += 1
             if self._row >= self.limit:
                 raise give_up(
@@ -134,15 +133,17 @@ class StepGuard:
             warn(f"{skipped} of the {len(noted)} steps up to {step} were skipped: {self._culprits} not finite")
         return skipped
 
-    def _described(self, names: list[str], norms: Sequence[Tensor]) -> str:
+    def _described(self, terms: int, present: list[bool], norms: Sequence[Tensor]) -> str:
         """What was not finite: "the loss", "the gradient of scales", and the parameters that are so themselves."""
-        values = [name for name, p in _parameters(self._optimizers) if not torch.isfinite(p).all()]
+        parameters = list(_parameters(self._optimizers))
+        values = [name for name, p in parameters if not torch.isfinite(p).all()]
         if values:
             return f"{', '.join(values)} (the values themselves) and what follows from them were"
+        names = [THE_LOSS] * terms + [name for (name, _), there in zip(parameters, present, strict=True) if there]
         broken = [name for name, norm in zip(names, norms, strict=True) if not math.isfinite(norm)]
         gradients = [name for name in broken if name != THE_LOSS]
         parts = [THE_LOSS] * (THE_LOSS in broken)
-        if len(gradients) == len(names) - names.count(THE_LOSS):
+        if len(gradients) == sum(present):
             parts.append("every gradient")
         elif gradients:
             parts.append(f"the gradient of {', '.join(gradients)}")
@@ -176,7 +177,7 @@ def _forget(optimizer: torch.optim.Optimizer, *_: Any) -> None:
 
 
 def _parameters(optimizers: Mapping[str, torch.optim.Optimizer]) -> Iterator[tuple[str, Tensor]]:
-    """Every parameter with its name. Not from a list of old: densification puts new ones into the optimisers."""
+    """Every parameter with its name, in the order of the optimisers."""
     for name, optimizer in optimizers.items():
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         for number, parameter in enumerate(parameters):
