@@ -19,7 +19,7 @@ class Command:
     """Folder for report.html, sheet.png, results.json, the datasets and the trained models."""
     data: Path | None = None
     """A nerfstudio dataset to show instead of the built-in scene; trained as it is, no artifact is added."""
-    steps: int = 600
+    steps: int = 800
     """Training steps of each run; schedules are scaled to it. A capture of megapixels wants thousands and a GPU."""
     scale_factor: float = 1.0
     """Photos of --data are resized by this, in (0, 1]."""

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 _PATIENCE = 200
 """Seconds until a server has to answer: on a loaded machine most of them go into importing."""
-_STEPS = 600
+_STEPS = 800
 _ADAPTIVE_RATIO = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*[\w$]+\)")
 """Where viser's page decides how many of the window's pixels it draws (0.2.7, which nerfstudio pins)."""
 
