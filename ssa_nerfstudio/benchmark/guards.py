@@ -1,12 +1,13 @@
 """What the guards cost: `python -m ssa_nerfstudio.benchmark.guards --data DIR`
 
-Two trainings of one process, with and without, take turns at blocks of steps, so that a machine that drifts drifts for
-both; the device is waited for between blocks only. Neither densifies: they draw the start points to the end, which are
-few, so that what the guards add weighs most. Prints the ratio of the times with its 95 % interval.
+Blocks of steps of one training take turns with and without, so that both draw the same Gaussians and a machine that
+drifts drifts for both; the device is waited for between blocks only. Nothing is densified: the start points are drawn
+to the end, which are few, so that what the guards add weighs most. Prints the ratio of the times with its interval.
 """
 
 from __future__ import annotations
 
+import copy
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,11 @@ import numpy as np
 import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
+from nerfstudio.engine.optimizers import Optimizers
 
 from ssa_nerfstudio.benchmark.run import configure, versions
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam
+from ssa_nerfstudio.plugin.guards import READ_EVERY
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 
@@ -31,18 +35,18 @@ class Command:
     """One of this plugin's methods."""
     overlay: str = "on"
     """on or off."""
-    blocks: int = 40
-    """Blocks of steps of each training; the first two warm up."""
-    block: int = 50
-    """Steps of a block."""
+    pairs: int = 60
+    """Pairs of blocks, one with guards and one without; the first two warm up."""
+    block: int = READ_EVERY
+    """Steps of a block: a multiple of those between two looks of the host, so that every block has as many."""
     scale_factor: float = 1.0
     """Photos are resized by this."""
 
     def run(self) -> None:
         """Train in turns and print one line."""
         with TemporaryDirectory() as folder:
-            trainers = [self._trainer(Path(folder) / str(guards), guards) for guards in (False, True)]
-            times = np.array([self._in_turn(trainers, b) for b in range(self.blocks)])[2:]
+            training = self._training(Path(folder))
+            times = np.array([self._pair(training, k) for k in range(self.pairs)])[2:]
         percent = 100 * (times[:, 1] / times[:, 0] - 1)
         draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
         low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
@@ -52,35 +56,62 @@ class Command:
             f"with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
         )
 
-    def _in_turn(self, trainers: list[SSATrainer], block: int) -> list[float]:
-        """Seconds of a block of both trainings; the one that is first is so every other time."""
-        first = block % 2
-        times = [self._time(trainers[k], block) for k in (first, 1 - first)]
-        return [times[first], times[1 - first]]
+    def _pair(self, training: Training, pair: int) -> tuple[float, float]:
+        """Seconds of a block without and of one with guards; the one that is first is so every other time."""
+        first = bool(pair % 2)
+        times = {first: self._time(training, first), (not first): self._time(training, not first)}
+        return times[False], times[True]
 
-    def _trainer(self, output: Path, guards: bool) -> SSATrainer:
-        # Without densification, which is random, both draw as many Gaussians.
-        model = {"overlay": self.overlay, "guards": guards, "num_downscales": 0, "stop_split_at": 0, "mcmc_stop_at": 0}
-        config = configure(self.method, self.data, output, self.blocks * self.block, model, self.scale_factor)
+    def _training(self, output: Path) -> Training:
+        model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": 0, "mcmc_stop_at": 0}
+        steps = 2 * self.pairs * self.block
+        config = configure(self.method, self.data, output, steps, model, self.scale_factor)
         config.scale_schedules = False
         torch.manual_seed(0)
         config.set_timestamp()
         trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.pipeline.train()
-        return trainer
+        return Training(trainer)
 
-    def _time(self, trainer: SSATrainer, block: int) -> float:
+    def _time(self, training: Training, guarded: bool) -> float:
+        training.switch(guarded)
         _wait()
         start = time.perf_counter()
-        for step in range(block * self.block, (block + 1) * self.block):
-            for callback in trainer.callbacks:
-                callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-            trainer.train_iteration(step)
-            for callback in trainer.callbacks:
-                callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        for _ in range(self.block):
+            training.step()
         _wait()
         return time.perf_counter() - start
+
+
+class Training:
+    """A training whose guards can be switched off and on as it goes."""
+
+    def __init__(self, trainer: SSATrainer) -> None:
+        self.trainer, self.steps = trainer, 0
+        self._guard, self._guarded = trainer.guard, trainer.optimizers
+        self._plain = copy.copy(trainer.optimizers)
+        self._plain.__class__ = Optimizers  # nerfstudio's, which hold the same optimisers
+
+    def switch(self, guarded: bool) -> None:
+        """Do as from the start with `guards` in the configuration."""
+        trainer, model = self.trainer, self.trainer.pipeline.model
+        trainer.guard = self._guard if guarded else None
+        trainer.optimizers = self._guarded if guarded else self._plain
+        model.config.guards = model.strategy.guarded = guarded
+        model.info = {}
+        for optimizer in trainer.optimizers.optimizers.values():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.refused = None
+
+    def step(self) -> None:
+        """Train one step, as nerfstudio's loop does."""
+        for callback in self.trainer.callbacks:
+            callback.run_callback_at_location(self.steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        self.trainer.train_iteration(self.steps)
+        for callback in self.trainer.callbacks:
+            callback.run_callback_at_location(self.steps, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        self.steps += 1
 
 
 def _wait() -> None:

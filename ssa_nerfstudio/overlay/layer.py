@@ -118,6 +118,10 @@ class ScreenSpaceOverlay(nn.Module):
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.register_buffer("near", torch.ones(*size, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
+        self.waiting = False
+        """For the scene: while True, an overlay learns near static edges only. Early in a training it explains anything
+        constant (the sky ahead of a walk) sooner than Gaussians can. What the scene has learned by itself when the wait
+        is over, the overlay gains nothing by taking."""
 
     @torch.no_grad()
     def start_from(self, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
@@ -152,6 +156,9 @@ class ScreenSpaceOverlay(nn.Module):
         else:
             scene = (mean - torch.where(opaque, 0.0, difference)).clamp(0, 1)
             addition = torch.minimum(alpha * scene + mean - scene, alpha)
+            implied = (matte > 0) | (difference != 0).any(dim=-1, keepdim=True)
+            usual = _usual_color(addition / alpha, torch.where(opaque, 0, matte))
+            addition = torch.where(opaque | implied, addition, alpha * usual)
         layers = torch.cat([alpha, addition, deviation, opaque, matte, near], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
@@ -169,18 +176,6 @@ class ScreenSpaceOverlay(nn.Module):
         self.near.copy_(near > 0)
 
     @torch.no_grad()
-    def wait_for_the_scene(self) -> None:
-        """Keep the overlay at next to nothing far from static edges.
-
-        Early in a training the overlay explains anything constant (the sky ahead of a walk) sooner than Gaussians can.
-        What the scene has learned by itself when the wait is over, the overlay gains nothing by taking.
-        """
-        start = math.log(MATTE_START_RANGE[0] / (1 - MATTE_START_RANGE[0]))
-        self.alpha_logits.copy_(torch.where(self.near > 0, self.alpha_logits, start))
-        if self.adds_light:
-            self.color_logits.copy_(torch.where(self.near > 0, self.color_logits, start))
-
-    @torch.no_grad()
     def keep_in_range(self) -> None:
         """Clamp the parameters to where a gradient can still move them (`MATTE_LOGIT_RANGE`, `COLOR_LOGIT_RANGE`)."""
         self.alpha_logits.clamp_(*MATTE_LOGIT_RANGE)
@@ -188,16 +183,16 @@ class ScreenSpaceOverlay(nn.Module):
 
     def color(self) -> Tensor:
         """W: straight colour, or the light that is added, [h, w, 3] in (0, 1)."""
-        return torch.sigmoid(self.color_logits)
+        return torch.sigmoid(self._learning(self.color_logits))
 
     def matte(self) -> Tensor:
         """A: opacity [h, w, 1] in (0, 1)."""
-        return torch.sigmoid(self.alpha_logits)
+        return torch.sigmoid(self._learning(self.alpha_logits))
 
     def opacity(self) -> Tensor:
         """What sparsity weighs, [h, w, 1]: A; of an artifact that adds light the largest of A and B."""
         if self.adds_light:
-            return torch.sigmoid(torch.maximum(self.alpha_logits, self.color_logits.amax(dim=-1, keepdim=True)))
+            return torch.maximum(self.matte(), self.color().amax(dim=-1, keepdim=True))
         return self.matte()
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
@@ -215,6 +210,10 @@ class ScreenSpaceOverlay(nn.Module):
         pair = torch.cat([transmittance, addition], dim=-1)
         pair = to_training_scale(pair, self.resolution, reduction, self.height, self.width)
         return pair[..., :1], pair[..., 1:]
+
+    def _learning(self, logits: Tensor) -> Tensor:
+        """The same values, without a gradient where the overlay is `waiting`."""
+        return torch.where(self.near > 0, logits, logits.detach()) if self.waiting else logits
 
 
 class GivenOverlay(nn.Module):
@@ -255,6 +254,16 @@ def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) 
     """An overlay's layers in a frame of any size and aspect: scaled, centred, never stretched; clear around it."""
     transmittance, addition = overlay.layers()
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
+
+
+def _usual_color(color: Tensor, matte: Tensor) -> Tensor:
+    """The mean colour [3] of an artifact, of colours [H, W, 3] weighed by a matte [H, W, 1]; those, if that is 0.
+
+    Where an artifact was missed, its colour is most likely this one, and a film of it is learned no sooner than it is
+    there. From the mean of the photos, the matte grows wherever a render is wrong: less contrast is a smaller error.
+    """
+    total = matte.sum()
+    return (color * matte).sum(dim=(0, 1)) / total if total > 0 else color
 
 
 def _evidence(deviation: Tensor, opaque: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
 from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig
 from torch import Tensor
@@ -171,15 +172,18 @@ class SSASplatfactoModel(SplatfactoModel):
         for name, values in self.gauss_params.items():
             self.gauss_params[name] = Parameter(values.data[outside])
 
+    def step_cb(self, optimizers: Optimizers, step: int) -> None:
+        """Before a step: whether overlays wait for the scene."""
+        super().step_cb(optimizers, step)
+        for overlay in self.artifacts.learned():
+            overlay.waiting = step < self.config.scene_head_start and self.config.overlay_start == "detected"
+
     def step_post_backward(self, step: int) -> None:
         """After the optimisers' step: bring parameters back into their range, then densify."""
         if self.config.guards and step % guards.RANGE_EVERY == 0:
             guards.keep_scales_in_range(self.scales)
             for overlay in self.artifacts.learned():
                 overlay.keep_in_range()
-        if step < self.config.scene_head_start and self.config.overlay_start == "detected":
-            for overlay in self.artifacts.learned():
-                overlay.wait_for_the_scene()
         super().step_post_backward(step)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
