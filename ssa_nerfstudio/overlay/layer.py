@@ -1,4 +1,4 @@
-"""The artifact as a picture in front of every view: parameters, matte, compositing.
+"""The artifact as a picture in front of every view: what is learned of it, its start, its layers.
 
 Source: the paper, section "Modeling screen-space artifacts"; light that hides nothing is ours.
 """
@@ -11,13 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.overlay.area import StaticArea
-from ssa_nerfstudio.overlay.resampling import (
-    letterbox,
-    reduced_size,
-    stack_premultiplied,
-    straight_color,
-    to_training_scale,
-)
+from ssa_nerfstudio.overlay.resampling import letterbox, reduced_size, stack_premultiplied, to_training_scale
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
 STATISTICS_SCALE = 0.05
@@ -34,60 +28,6 @@ COLOR_LOGIT_RANGE = (-12.0, 12.0)
 """While it learns, the colour stays between 6e-6 and 1 - 6e-6, for the same reason."""
 COLOR_START_RANGE = (1 / 510, 1 - 1 / 510)
 """The starting colour is clamped to this before the logit: half a grey level from black and white."""
-
-
-def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
-    """Put an artifact in front of a render: I = T C + B (equation "composition" with T = 1 - A, B = A W).
-
-    Args:
-        clean: [H, W, 3] in [0, 1].
-        transmittance: [H, W, 1] or [H, W, 3] in [0, 1].
-        addition: [H, W, 3], not negative.
-    """
-    return transmittance * clean + addition
-
-
-def composite_over_splats(
-    clean: Tensor, accumulation: Tensor, background: Tensor, transmittance: Tensor, addition: Tensor
-) -> Tensor:
-    """`composite`, with a gradient of the matte that sees splats only: an overlay gains nothing by hiding background.
-
-    Where no splat covers a pixel, the render shows the background colour (in splatfacto a random one at every step).
-    Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
-    Here the matte is judged as if the overlay's own colour stood behind the splats: there, nothing is gained, sparsity
-    takes the overlay back, and the scene has to fill the hole.
-
-    Args:
-        clean: [H, W, 3], the render with its background.
-        accumulation: [H, W, 1], opacity of the splats.
-        background: [3], the colour behind them.
-        transmittance, addition: [H, W, 1] and [H, W, 3].
-
-    Returns:
-        [H, W, 3], the same values as `composite`.
-    """
-    picture = composite(clean, transmittance, addition)
-    with torch.no_grad():
-        color, _ = straight_color(transmittance, addition)
-        without_background = (1.0 - accumulation) * (color - background)
-    return picture + (transmittance - transmittance.detach()) * without_background
-
-
-class _Clipped(torch.autograd.Function):
-    """Clip to [0, 1]; the gradient passes. A prediction beyond white is to be brought back, not left alone."""
-
-    @staticmethod
-    def forward(ctx, picture: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return picture.clamp(0.0, 1.0)
-
-    @staticmethod
-    def backward(ctx, v: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return v
-
-
-def clipped(picture: Tensor) -> Tensor:
-    """What a photo records of I = T C + B: [0, 1]. Its gradient is that of the identity."""
-    return _Clipped.apply(picture)  # pyright: ignore[reportReturnType]
 
 
 class ScreenSpaceOverlay(nn.Module):

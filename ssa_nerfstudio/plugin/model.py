@@ -16,7 +16,7 @@ from torch.nn import Parameter
 
 from ssa_nerfstudio import metrics
 from ssa_nerfstudio.errors import warn
-from ssa_nerfstudio.overlay.layer import clipped, composite, composite_over_splats
+from ssa_nerfstudio.overlay.compositing import clipped, composite, composite_over_splats
 from ssa_nerfstudio.overlay.losses import Sparsity, SSIMBody, photometric, sparsity
 from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.overlay.resampling import straight_color
@@ -312,7 +312,7 @@ class SSASplatfactoModel(SplatfactoModel):
         learned = self.artifacts.learned()
         if learned and self.config.sparsity != "off":
             terms = [sparsity(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
-            losses["sparsity"] = self.config.sparsity_weight * torch.stack(terms).mean()
+            losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
         if self.config.strategy == "mcmc":
             losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()
             losses["mcmc_scale_reg"] = self.config.mcmc_scale_regularizer * torch.exp(self.scales).mean()

@@ -19,7 +19,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerDropdown, ViewerElement, ViewerSlider
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.layer import composite
+from ssa_nerfstudio.overlay.compositing import composite
 from ssa_nerfstudio.overlay.pictures import over_checkerboard, straight_bytes
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.artifacts import Artifacts

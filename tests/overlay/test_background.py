@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay, composite, composite_over_splats
+from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 
 def scene(accumulation: float) -> tuple[ScreenSpaceOverlay, torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -14,8 +14,9 @@ from nerfstudio.models.splatfacto import resize_image
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.area import StaticArea
+from ssa_nerfstudio.overlay.compositing import clipped, composite
 from ssa_nerfstudio.overlay.detection import static_area
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, clipped, composite
+from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 
 

@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, composite, fitted
+from ssa_nerfstudio.overlay.compositing import composite
+from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
 from ssa_nerfstudio.overlay.resampling import (
     box_reduce,
     enlarge,

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay, composite, composite_over_splats, fitted
+from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay, fitted
 from ssa_nerfstudio.overlay.losses import SSIM_WINDOW, Sparsity, photometric, photometric_reference, sparsity
 from ssa_nerfstudio.overlay.resampling import box_reduce, letterbox, stack_premultiplied, straight_color
 

@@ -1,0 +1,79 @@
+"""The picture that a photo shows of a render and the artifact in front of it.
+
+Source: the paper, equation "composition"; that the matte sees splats only is ours (docs/method.md).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
+    """Put an artifact in front of a render: I = T C + B (equation "composition" with T = 1 - A, B = A W).
+
+    Args:
+        clean: [H, W, 3] in [0, 1].
+        transmittance: [H, W, 1] or [H, W, 3] in [0, 1].
+        addition: [H, W, 3], not negative.
+    """
+    return transmittance * clean + addition
+
+
+def composite_over_splats(
+    clean: Tensor, accumulation: Tensor, background: Tensor, transmittance: Tensor, addition: Tensor
+) -> Tensor:
+    """`composite`, with a gradient of the matte that sees splats only: an overlay gains nothing by hiding background.
+
+    Where no splat covers a pixel, the render shows the background colour (in splatfacto a random one at every step).
+    Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
+    Here the matte is judged as if the overlay's own colour stood behind the splats: there, nothing is gained, sparsity
+    takes the overlay back, and the scene has to fill the hole.
+
+    Args:
+        clean: [H, W, 3], the render with its background.
+        accumulation: [H, W, 1], opacity of the splats.
+        background: [3], the colour behind them.
+        transmittance, addition: [H, W, 1] and [H, W, 3] in [0, 1].
+
+    Returns:
+        [H, W, 3], the same values as `composite`.
+    """
+    with torch.no_grad():
+        # Straight colour, as `resampling.straight_color` of one channel of T, in half as many kernels.
+        alpha = torch.maximum(1.0 - transmittance, addition.amax(dim=-1, keepdim=True)).clamp_min(1e-6)
+        over_color = clean + (1.0 - accumulation) * (addition / alpha - background)
+    return _OverSplats.apply(clean, transmittance, addition, over_color)  # pyright: ignore[reportReturnType]
+
+
+def clipped(picture: Tensor) -> Tensor:
+    """What a photo records of I = T C + B: [0, 1]. Its gradient is that of the identity."""
+    return _Clipped.apply(picture)  # pyright: ignore[reportReturnType]
+
+
+class _OverSplats(torch.autograd.Function):
+    """T C + B, whose gradient of T is taken at another render. By hand: a step waits for the host, not for the GPU."""
+
+    @staticmethod
+    def forward(ctx, clean: Tensor, transmittance: Tensor, addition: Tensor, over_color: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.save_for_backward(transmittance, over_color)
+        return composite(clean, transmittance, addition)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, v: Tensor):  # pyright: ignore[reportIncompatibleMethodOverride]
+        transmittance, over_color = ctx.saved_tensors
+        return v * transmittance, (v * over_color).sum(dim=-1, keepdim=True), v, None
+
+
+class _Clipped(torch.autograd.Function):
+    """Clip to [0, 1]; the gradient passes. A prediction beyond white is to be brought back, not left alone."""
+
+    @staticmethod
+    def forward(ctx, picture: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return picture.clamp(0.0, 1.0)
+
+    @staticmethod
+    def backward(ctx, v: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return v
