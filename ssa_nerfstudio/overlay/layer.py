@@ -58,10 +58,7 @@ class ScreenSpaceOverlay(nn.Module):
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.register_buffer("near", torch.ones(*size, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
-        self.waiting = False
-        """For the scene: while True, an overlay learns near static edges only. Early in a training it explains anything
-        constant (the sky ahead of a walk) sooner than Gaussians can. What the scene has learned by itself when the wait
-        is over, the overlay gains nothing by taking."""
+        self._held: tuple[Tensor, ...] = ()
 
     @torch.no_grad()
     def start_from(self, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
@@ -116,6 +113,28 @@ class ScreenSpaceOverlay(nn.Module):
         self.near.copy_(near > 0)
 
     @torch.no_grad()
+    def wait_for_the_scene(self, waiting: bool) -> None:
+        """Hold what is far from static edges as it is, from the first step for which this is said to the last.
+
+        Early in a training an overlay explains anything constant (the sky ahead of a walk) sooner than Gaussians can.
+        What the scene has learned by itself when the wait is over, the overlay gains nothing by taking.
+        """
+        if not waiting:
+            self._held = ()
+        elif not self._held:
+            self._held = tuple(parameter.clone() for parameter in self.parameters())
+
+    @torch.no_grad()
+    def take_back(self) -> None:
+        """After a step: undo it where the overlay waits.
+
+        Rather than to let no gradient through: Adam would not know its size when the wait is over, and start with steps
+        six times too large.
+        """
+        for parameter, held in zip(self.parameters(), self._held, strict=bool(self._held)):
+            parameter.copy_(torch.where(self.near > 0, parameter, held))
+
+    @torch.no_grad()
     def keep_in_range(self) -> None:
         """Clamp the parameters to where a gradient can still move them (`MATTE_LOGIT_RANGE`, `COLOR_LOGIT_RANGE`)."""
         self.alpha_logits.clamp_(*MATTE_LOGIT_RANGE)
@@ -123,16 +142,16 @@ class ScreenSpaceOverlay(nn.Module):
 
     def color(self) -> Tensor:
         """W: straight colour, or the light that is added, [h, w, 3] in (0, 1)."""
-        return torch.sigmoid(self._learning(self.color_logits))
+        return torch.sigmoid(self.color_logits)
 
     def matte(self) -> Tensor:
         """A: opacity [h, w, 1] in (0, 1)."""
-        return torch.sigmoid(self._learning(self.alpha_logits))
+        return torch.sigmoid(self.alpha_logits)
 
     def opacity(self) -> Tensor:
         """What sparsity weighs, [h, w, 1]: A; of an artifact that adds light the largest of A and B."""
         if self.adds_light:
-            return torch.maximum(self.matte(), self.color().amax(dim=-1, keepdim=True))
+            return torch.sigmoid(torch.maximum(self.alpha_logits, self.color_logits.amax(dim=-1, keepdim=True)))
         return self.matte()
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
@@ -150,10 +169,6 @@ class ScreenSpaceOverlay(nn.Module):
         pair = torch.cat([transmittance, addition], dim=-1)
         pair = to_training_scale(pair, self.resolution, reduction, self.height, self.width)
         return pair[..., :1], pair[..., 1:]
-
-    def _learning(self, logits: Tensor) -> Tensor:
-        """The same values, without a gradient where the overlay is `waiting`."""
-        return torch.where(self.near > 0, logits, logits.detach()) if self.waiting else logits
 
 
 class GivenOverlay(nn.Module):

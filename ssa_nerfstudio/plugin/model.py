@@ -175,11 +175,14 @@ class SSASplatfactoModel(SplatfactoModel):
     def step_cb(self, optimizers: Optimizers, step: int) -> None:
         """Before a step: whether overlays wait for the scene."""
         super().step_cb(optimizers, step)
+        waiting = step < self.config.scene_head_start and self.config.overlay_start == "detected"
         for overlay in self.artifacts.learned():
-            overlay.waiting = step < self.config.scene_head_start and self.config.overlay_start == "detected"
+            overlay.wait_for_the_scene(waiting)
 
     def step_post_backward(self, step: int) -> None:
         """After the optimisers' step: bring parameters back into their range, then densify."""
+        for overlay in self.artifacts.learned():
+            overlay.take_back()
         if self.config.guards and step % guards.RANGE_EVERY == 0:
             guards.keep_scales_in_range(self.scales)
             for overlay in self.artifacts.learned():

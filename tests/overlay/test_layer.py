@@ -329,16 +329,18 @@ def test_while_it_waits_for_the_scene_nothing_is_learned_far_from_static_edges(a
     overlay.adds_light = adds_light
     overlay.near[:, 3:] = 0
     adam = torch.optim.Adam(overlay.parameters(), lr=0.1, eps=1e-15)
-    for waiting in (True, False):
-        before = torch.cat([parameter.detach().clone() for parameter in overlay.parameters()], dim=-1)
-        overlay.waiting = waiting
+    start = torch.cat([parameter.detach().clone() for parameter in overlay.parameters()], dim=-1)
+    for waiting in (True, True, False):
+        overlay.wait_for_the_scene(waiting)
         loss = composite(random(4, 6, 3), *overlay.layers()).mean() + overlay.opacity().mean()
         adam.zero_grad()
         loss.backward()
         adam.step()
-        moved = torch.cat(list(overlay.parameters()), dim=-1) != before
+        overlay.take_back()
+        moved = (torch.cat(list(overlay.parameters()), dim=-1) - start).abs()
         assert moved[:, :3].all()
         assert moved[:, 3:].all() if not waiting else not moved[:, 3:].any()
+    assert moved[:, 3:].max() < 0.11, "the first step after a wait is as large as any"
 
 
 def test_the_scene_gets_the_share_of_the_gradient_that_the_matte_lets_through() -> None:
