@@ -30,7 +30,7 @@ demo: $(READY)
 	$(BIN)/ssa demo $(if $(DATA),--data "$(DATA)") $(DEMO_OPTIONS)
 
 docs: $(READY)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -W ignore -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -W ignore -m mkdocs build --strict
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal

@@ -44,7 +44,7 @@ def check_settings(model: SSASplatfactoModelConfig, device: torch.device | str) 
     """Refuse settings of the model that contradict each other or the machine."""
     if not model.sparsity_weight >= 0:
         raise refuse(
-            f"--pipeline.model.sparsity-weight {model.sparsity_weight} must not be negative; 0.05 is the default"
+            f"--pipeline.model.sparsity-weight {model.sparsity_weight} must not be negative; 0.02 is the default"
         )
     if model.rasterizer == "reference" and model.use_absgrad and model.strategy == "adc":
         raise refuse("--pipeline.model.rasterizer reference has no absgrad; add --pipeline.model.use-absgrad False")
