@@ -25,7 +25,7 @@ from ssa_nerfstudio.benchmark.machine import versions
 from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
-from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
 
@@ -290,9 +290,11 @@ def _require_alive(model: SSASplatfactoModel, cause: Exception | None = None) ->
 
 def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
     """Settings of the model by field name, from name=value."""
-    pairs = (setting.split("=", 1) for setting in settings)
-    # YAML reads on and off as booleans.
-    model = {name: value if value in ("on", "off") else yaml.safe_load(value) for name, value in pairs}
+    usual, model = SSASplatfactoModelConfig(), {}
+    for name, value in (setting.split("=", 1) for setting in settings):
+        model[name] = yaml.safe_load(value)
+        if isinstance(model[name], bool) and isinstance(getattr(usual, name, None), str):
+            model[name] = value.lower()  # YAML reads on and off as booleans
     if "overlay_given" in model:
         model["overlay_given"] = Path(model["overlay_given"])
     return model

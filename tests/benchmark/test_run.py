@@ -7,13 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from ssa_nerfstudio.benchmark.artifact_scores import score, true_layers
-from ssa_nerfstudio.benchmark.run import Diverged, configure, train_and_evaluate
+from ssa_nerfstudio.benchmark.run import Diverged, configure, model_settings, train_and_evaluate
 from ssa_nerfstudio.effects.layers import Layers
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 FULL = {"num_downscales": 0}
+
+
+def test_on_and_off_are_words_where_a_setting_has_words_and_truths_where_it_has_those():
+    given = ("overlay=On", "sparsity=off", "overlay_light=on", "guards=off", "use_absgrad=on", "sparsity_weight=0.5")
+    assert model_settings(given) == {
+        "overlay": "on",
+        "sparsity": "off",
+        "overlay_light": "on",
+        "guards": False,
+        "use_absgrad": True,
+        "sparsity_weight": 0.5,
+    }
 
 
 @pytest.fixture(scope="module")
@@ -107,3 +120,24 @@ def test_a_truth_of_another_size_is_averaged(tmp_path: Path):
     small = Layers(layers.transmittance[::2, ::2].copy(), layers.addition[::2, ::2].copy())
     scores = score(_overlay(small), *true_layers(tmp_path / "layers.npz", 0, 1))
     assert scores["matte_error"] < 1e-5
+
+
+def test_what_is_far_from_static_edges_waits_for_the_scene_and_is_learned_then(tiny_scene, tmp_path):
+    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 8, {**FULL, "overlay": "on", "scene_head_start": 4})
+    config.scale_schedules = False
+    config.set_timestamp()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    (overlay,) = trainer.pipeline.model.artifacts.learned()
+    overlay.near[:, 20:] = 0
+    start = overlay.alpha_logits.detach().clone()
+    trainer.pipeline.train()
+    for step in range(8):
+        for place in (TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION):
+            if place is TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
+                trainer.train_iteration(step)
+            for callback in trainer.callbacks:
+                callback.run_callback_at_location(step, place)
+        moved = overlay.alpha_logits != start
+        assert moved[:, :20].any()
+        assert moved[:, 20:].any() == (step >= 4)
