@@ -94,8 +94,9 @@ class ScreenSpaceOverlay(nn.Module):
             scene = (mean - torch.where(opaque, 0.0, difference)).clamp(0, 1)
             addition = torch.minimum(alpha * scene + mean - scene, alpha)
             implied = (matte > 0) | (difference != 0).any(dim=-1, keepdim=True)
-            usual = _usual_color(addition / alpha, torch.where(opaque, 0, matte))
-            addition = torch.where(opaque | implied, addition, alpha * usual)
+            shown = torch.where(opaque, 0, matte)
+            if shown.any():
+                addition = torch.where(opaque | implied, addition, alpha * _mean_color(addition / alpha, shown))
         layers = torch.cat([alpha, addition, deviation, opaque, matte, near], dim=-1)
         size = self.alpha_logits.shape[:2]
         if self.resolution > 1:
@@ -211,14 +212,13 @@ def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) 
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
 
 
-def _usual_color(color: Tensor, matte: Tensor) -> Tensor:
-    """The mean colour [3] of an artifact, of colours [H, W, 3] weighed by a matte [H, W, 1]; those, if that is 0.
+def _mean_color(color: Tensor, matte: Tensor) -> Tensor:
+    """The mean colour [3] of an artifact, of colours [H, W, 3] weighed by a matte [H, W, 1].
 
     Where an artifact was missed, its colour is most likely this one, and a film of it is learned no sooner than it is
     there. From the mean of the photos, the matte grows wherever a render is wrong: less contrast is a smaller error.
     """
-    total = matte.sum()
-    return (color * matte).sum(dim=(0, 1)) / total if total > 0 else color
+    return (color.clamp(0, 1) * matte).sum(dim=(0, 1)) / matte.sum()
 
 
 def _evidence(deviation: Tensor, opaque: Tensor) -> Tensor:

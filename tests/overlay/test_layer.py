@@ -217,6 +217,27 @@ def test_where_edges_imply_nothing_the_overlay_starts_in_the_colour_that_it_has_
     torch.testing.assert_close(overlay.matte()[..., 0], matte.clamp_min(0.1), atol=1e-3, rtol=0)
 
 
+def test_what_is_opaque_or_only_coloured_keeps_its_own_colour_and_what_is_opaque_lends_it_to_nobody() -> None:
+    """From left to right: an opaque board, a drop, an edge too faint for a matte, nothing."""
+    _, statistics = capture(6, 12)
+    mean = statistics.mean().float()
+    opaque, matte, difference = torch.zeros(6, 12, dtype=torch.bool), torch.zeros(6, 12), torch.zeros(6, 12, 3)
+    opaque[:, :3] = True
+    matte[:, :6] = 0.5
+    difference[:, 3:9] = 0.05
+    everywhere = torch.ones(6, 12, dtype=torch.bool)
+    overlay = ScreenSpaceOverlay(6, 12)
+    overlay.start_from(statistics, StaticArea(everywhere, everywhere, opaque, matte, difference, adds_light=False))
+    color = overlay.color().detach()
+    implied = (mean - (1 - torch.clamp(matte, min=0.1)[..., None]) * (mean - difference).clamp(0, 1)) / torch.clamp(
+        matte, min=0.1
+    )[..., None]
+    torch.testing.assert_close(color[:, :3], mean[:, :3].clamp(1 / 510, 1 - 1 / 510), atol=1e-3, rtol=0)
+    torch.testing.assert_close(color[:, 3:9], implied[:, 3:9].clamp(1 / 510, 1 - 1 / 510), atol=1e-3, rtol=0)
+    usual = implied[:, 3:6].clamp(0, 1).mean(dim=(0, 1))
+    torch.testing.assert_close(color[:, 9:], usual.expand(6, 3, 3), atol=1e-3, rtol=0)
+
+
 @pytest.mark.parametrize("resolution", [1, 2])
 def test_what_adds_light_starts_from_the_difference_and_hides_only_where_it_is_opaque(resolution: int) -> None:
     _, statistics = capture(12, 16)
