@@ -20,6 +20,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.engine.optimizers import Optimizers
 
 from ssa_nerfstudio.benchmark.run import configure, versions
+from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.plugin.fused_adam import FusedAdam
 from ssa_nerfstudio.plugin.guards import READ_EVERY
 from ssa_nerfstudio.plugin.trainer import SSATrainer
@@ -44,6 +45,8 @@ class Command:
 
     def run(self) -> None:
         """Train in turns and print one line."""
+        if self.block % READ_EVERY or self.pairs < 3:
+            raise refuse(f"--block must be a multiple of {READ_EVERY} and --pairs at least 3")
         with TemporaryDirectory() as folder:
             training = self._training(Path(folder))
             times = np.array([self._pair(training, k) for k in range(self.pairs)])[2:]
