@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.estimate import SMALLEST_AREA, estimate, opaque, textured
+from ssa_nerfstudio.overlay.estimate import connected, estimate, opaque, textured
 from ssa_nerfstudio.overlay.formation import adds_light
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
@@ -123,13 +123,7 @@ def _at_full_size(layer: np.ndarray, statistics: ImageStatistics) -> Tensor:
 def _supported(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """Those connected areas whose outline is made of edges for a share of EDGE_SUPPORT: uint8 [h, w]."""
     supported = np.zeros_like(areas)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
-    for label in range(1, count):
-        x, y, w, h, size = boxes[label]
-        if size < SMALLEST_AREA:
-            continue
-        box = slice(max(0, y - 1), y + h + 1), slice(max(0, x - 1), x + w + 1)
-        inside = (labels[box] == label).astype(np.uint8)
+    for box, inside in connected(areas, margin=1):
         outline = cv2.dilate(inside, _AROUND) > inside
         if not outline.any() or edges[box][outline].mean() >= EDGE_SUPPORT:
             supported[box] |= inside

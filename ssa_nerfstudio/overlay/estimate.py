@@ -10,6 +10,7 @@ docs/method.md derives it.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
@@ -82,13 +83,7 @@ def opaque(areas: np.ndarray, deviation: np.ndarray) -> np.ndarray:
     areas = cv2.morphologyEx(areas, cv2.MORPH_CLOSE, _square(3))
     level = np.log(deviation + _LEVEL)
     kept = np.zeros_like(areas)
-    count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
-    for label in range(1, count):
-        x, y, w, h, size = boxes[label]
-        if size < SMALLEST_AREA:
-            continue
-        box = slice(max(0, y - 4), y + h + 4), slice(max(0, x - 4), x + w + 4)
-        area = (labels[box] == label).astype(np.uint8)
+    for box, area in connected(areas, margin=4):
         outside = cv2.dilate(area, _square(7)) > cv2.dilate(area, _square(3))
         within = area > cv2.erode(area, _square(5))
         everything = not outside.any() or not within.any()
@@ -110,6 +105,16 @@ def textured(edges: np.ndarray, deviation: np.ndarray) -> np.ndarray:
     dense = cv2.blur(edges.astype(np.float32), (TEXTURE_WINDOW, TEXTURE_WINDOW)) >= TEXTURED_SHARE
     calm = deviation < TEXTURED_DEVIATION * np.quantile(deviation, 0.75)
     return cv2.morphologyEx((dense & calm).astype(np.uint8), cv2.MORPH_CLOSE, _square(3))
+
+
+def connected(areas: np.ndarray, margin: int) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Each connected area of at least SMALLEST_AREA: a box around it with a margin, and the area in it, uint8."""
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
+    for label in range(1, count):
+        x, y, w, h, size = boxes[label]
+        if size >= SMALLEST_AREA:
+            box = slice(max(0, y - margin), y + h + margin), slice(max(0, x - margin), x + w + margin)
+            yield box, (labels[box] == label).astype(np.uint8)
 
 
 def _static_part(image: np.ndarray, edges: np.ndarray) -> np.ndarray:
