@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ssa_nerfstudio.overlay.resampling import straight_color
+
 
 def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
     """Put an artifact in front of a render: I = T C + B (equation "composition" with T = 1 - A, B = A W).
@@ -41,9 +43,8 @@ def composite_over_splats(
         [H, W, 3], the same values as `composite`.
     """
     with torch.no_grad():
-        # Straight colour, as `resampling.straight_color` of one channel of T, in half as many kernels.
-        alpha = torch.maximum(1.0 - transmittance, addition.amax(dim=-1, keepdim=True)).clamp_min(1e-6)
-        over_color = clean + (1.0 - accumulation) * (addition / alpha - background)
+        color, _ = straight_color(transmittance, addition)
+        over_color = clean + (1.0 - accumulation) * (color - background)
     return _OverSplats.apply(clean, transmittance, addition, over_color)  # pyright: ignore[reportReturnType]
 
 

@@ -127,12 +127,12 @@ class ScreenSpaceOverlay(nn.Module):
 
     @torch.no_grad()
     def take_back(self) -> None:
-        """After a step: undo it where the overlay waits.
+        """After a step: undo it where the overlay waits; where it does not, nothing is held.
 
         Rather than to let no gradient through: Adam would not know its size when the wait is over, and start with steps
         six times too large.
         """
-        for parameter, held in zip(self.parameters(), self._held, strict=bool(self._held)):
+        for parameter, held in zip(self.parameters(), self._held, strict=False):
             parameter.copy_(torch.where(self.near > 0, parameter, held))
 
     @torch.no_grad()

@@ -87,5 +87,4 @@ def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Ten
     """
     alpha = torch.maximum(1.0 - transmittance.mean(dim=-1, keepdim=True), addition.amax(dim=-1, keepdim=True))
     alpha = alpha.clamp_max(1.0)
-    color = torch.where(alpha > 0, addition / alpha.clamp_min(1e-6), torch.zeros_like(addition))
-    return color.clamp(0.0, 1.0), alpha
+    return (addition / alpha.clamp_min(1e-6)).clamp(0.0, 1.0), alpha
