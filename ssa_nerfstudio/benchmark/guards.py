@@ -107,14 +107,15 @@ class Training:
             if isinstance(optimizer, FusedAdam):
                 optimizer.refused = None
 
-    def step(self) -> None:
-        """Train one step, as nerfstudio's loop does."""
+    def step(self) -> dict[str, torch.Tensor]:
+        """Train one step, as nerfstudio's loop does: the terms of its loss."""
         for callback in self.trainer.callbacks:
             callback.run_callback_at_location(self.steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        self.trainer.train_iteration(self.steps)
+        _, losses, _ = self.trainer.train_iteration(self.steps)
         for callback in self.trainer.callbacks:
             callback.run_callback_at_location(self.steps, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         self.steps += 1
+        return losses
 
 
 def _wait() -> None:

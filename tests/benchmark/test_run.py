@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from ssa_nerfstudio.benchmark.artifact_scores import score, true_layers
+from ssa_nerfstudio.benchmark.guards import Training
 from ssa_nerfstudio.benchmark.run import Diverged, configure, model_settings, train_and_evaluate
 from ssa_nerfstudio.effects.layers import Layers
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
@@ -132,12 +132,9 @@ def test_what_is_far_from_static_edges_waits_for_the_scene_and_is_learned_then(t
     overlay.near[:, 20:] = 0
     start = overlay.alpha_logits.detach().clone()
     trainer.pipeline.train()
+    training = Training(trainer)
     for step in range(8):
-        for place in (TrainingCallbackLocation.BEFORE_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN_ITERATION):
-            if place is TrainingCallbackLocation.AFTER_TRAIN_ITERATION:
-                trainer.train_iteration(step)
-            for callback in trainer.callbacks:
-                callback.run_callback_at_location(step, place)
+        training.step()
         moved = overlay.alpha_logits != start
         assert moved[:, :20].any()
         assert moved[:, 20:].any() == (step >= 4)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 import torch
 
 from ssa_nerfstudio.benchmark import divergence, guards
@@ -36,8 +37,9 @@ def test_a_parameter_that_breaks_is_named_with_its_step(tiny_scene, tmp_path, mo
     assert run["verdict"].startswith("quats first not finite at step 7")
 
 
-def test_the_cost_of_the_guards_is_printed_with_its_interval(tiny_scene, capsys):
-    guards.Command(data=tiny_scene, overlay="off", pairs=3).run()
+@pytest.mark.parametrize("overlay", ["on", "off"])
+def test_the_cost_of_the_guards_is_printed_with_its_interval(tiny_scene, capsys, overlay):
+    guards.Command(data=tiny_scene, overlay=overlay, pairs=3).run()
     line = capsys.readouterr().out.strip().splitlines()[-1]
     assert "ms a step without guards; with them" in line
     assert "95 %" in line

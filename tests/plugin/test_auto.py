@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import torch
 from conftest import edit_transforms
-from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
+from ssa_nerfstudio.benchmark.guards import Training
 from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
 from ssa_nerfstudio.demo.scene import DemoScene
 from ssa_nerfstudio.plugin import first_look
@@ -37,14 +37,8 @@ def losses(data: Path, output: Path, overlay: str, steps: int = 50) -> tuple[lis
     config.set_timestamp()
     trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
-    seen = []
-    for step in range(steps):
-        for callback in trainer.callbacks:
-            callback.run_callback_at_location(step, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
-        _, parts, _ = trainer.train_iteration(step)
-        for callback in trainer.callbacks:
-            callback.run_callback_at_location(step, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
-        seen.append({name: float(value) for name, value in parts.items()})
+    training = Training(trainer)
+    seen = [{name: float(value) for name, value in training.step().items()} for _ in range(steps)]
     return seen, trainer
 
 
