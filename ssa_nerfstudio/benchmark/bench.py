@@ -16,7 +16,7 @@ from ssa_nerfstudio.benchmark.local import Local
 from ssa_nerfstudio.benchmark.machine import devices
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.progress import ProgressTable
-from ssa_nerfstudio.benchmark.results import Result, read_all
+from ssa_nerfstudio.benchmark.results import Result, adopt, read_all
 from ssa_nerfstudio.benchmark.scenes import prepare
 from ssa_nerfstudio.benchmark.workplace import Workplace
 from ssa_nerfstudio.errors import refuse
@@ -76,7 +76,13 @@ def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, 
     for problem in problems:
         console.print(f"ignored: {problem}", style="yellow", highlight=False, soft_wrap=True)
     done = {result.run.id for result in results if result.status != "failed"}
-    todo = [run for run in runs if run.id not in done]
+    missing = [run for run in runs if run.id not in done]
+    known = {result.run.training: result for result in results if result.status != "failed"}
+    trainings: dict[str, Run] = {}
+    for run in missing:
+        if run.training not in known:
+            trainings.setdefault(run.training, run)
+    todo = list(trainings.values())
     prepare(todo, place.scenes, place.artifacts, options.threads)
 
     def command(run: Run) -> str:
@@ -84,19 +90,29 @@ def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, 
 
     found = devices()
     at_once = max(1, len(found)) * options.runs_per_device
-    with ProgressTable(console, len(runs), len(runs) - len(todo), at_once) as table:
-        if options.scheduler is not None:
-            cluster = Cluster(place, options.scheduler, options.runs_per_device, command, options.keep_models)
-            return cluster.work(todo, deadline, table.watch_cluster, table.ended)
+    with ProgressTable(console, len(runs), len(runs) - len(missing), at_once) as table:
         expected = Expectation(results)
 
         def ended(run: Run, result: Result | None) -> None:
-            if result is not None:
-                expected.add(result)
             table.ended(run, result)
+            if result is None or result.status == "failed":
+                return
+            expected.add(result)
+            for other in missing:
+                if other.training == run.training and other.id != run.id:
+                    table.ended(other, adopt(result, other, place.folder))
 
-        local = Local(place, found, options.runs_per_device, command, options.keep_models)
-        return local.work(todo, expected.seconds, deadline, table.watch, ended)
+        for run in missing:
+            if run.training in known:
+                table.ended(run, adopt(known[run.training], run, place.folder))
+        if options.scheduler is not None:
+            cluster = Cluster(place, options.scheduler, options.runs_per_device, command, options.keep_models)
+            left = cluster.work(todo, deadline, table.watch_cluster, ended)
+        else:
+            local = Local(place, found, options.runs_per_device, command, options.keep_models)
+            left = local.work(todo, expected.seconds, deadline, table.watch, ended)
+    undone = {run.training for run in left}
+    return [run for run in missing if run.training in undone]
 
 
 class Expectation:

@@ -67,6 +67,11 @@ class Run:
         return "-".join([*parts, *(f"{k}={v}" for k, v in self.variation.items() if k not in RUN_KNOBS), digest])
 
     @property
+    def training(self) -> str:
+        """Equal for runs that differ in nothing but the name of their method: one training answers for all of them."""
+        return dataclasses.replace(self, method="").id
+
+    @property
     def dataset(self) -> str:
         """Name of the folder of its prepared dataset; runs that share it train on the same photos."""
         seed = f"-e{self.effect_seed}" if self.effect_seed else ""

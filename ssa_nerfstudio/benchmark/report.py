@@ -90,6 +90,9 @@ def _overview(results: list[Result], planned: set[str], problems: list[str], fol
     contents: list[Table | Picture] = [Table("Made on", ["device", "torch", "gsplat", "revision", "runs"], rows)]
     if len({key[3] for key in made}) > 1:
         text.append("**Runs of several revisions of the code are mixed here.**")
+    shared = sum(bool(r.same_as) for r in results)
+    if shared:
+        text.append(f"{shared} of them are the trainings of others under another method's name, and were not repeated.")
     troubles = [[r.run.id, r.status, r.reason] for r in results if r.status != "finished"]
     if troubles:
         contents.append(Table("Runs that did not finish", ["run", "", "why"], troubles))

@@ -53,6 +53,8 @@ class Result:
     """git revision of the code; + where files differed from it."""
     command: str = ""
     """What repeats this run."""
+    same_as: str = ""
+    """Id of the run that was trained, where this one is the same training under another method's name."""
     ended: str = ""
     """When, UTC, ISO 8601."""
 
@@ -135,16 +137,33 @@ def merge(source: Path, target: Path) -> int:
         run = result.run.id
         if run in present and (present[run].status != "failed" or result.status == "failed"):
             continue
-        for kind, suffix in (("pictures", ""), ("logs", ".log")):
-            origin, goal = source / kind / f"{run}{suffix}", target / kind / f"{run}{suffix}"
-            if origin.is_dir():
-                shutil.copytree(origin, goal, dirs_exist_ok=True)
-            elif origin.exists():
-                goal.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(origin, goal)
+        _copy_companions(source, run, target, run)
         write(result, target / "results" / f"{run}.json")
         copied += 1
     return copied
+
+
+def adopt(result: Result, run: Run, folder: Path) -> Result:
+    """Writes a result, with pictures and log, for another run of the same training.
+
+    Returns:
+        What was written.
+    """
+    _copy_companions(folder, result.run.id, folder, run.id)
+    adopted = dataclasses.replace(result, run=run, same_as=result.same_as or result.run.id)
+    write(adopted, folder / "results" / f"{run.id}.json")
+    return adopted
+
+
+def _copy_companions(source: Path, run: str, target: Path, name: str) -> None:
+    """Pictures and log of a run to another folder, or under another name."""
+    for kind, suffix in (("pictures", ""), ("logs", ".log")):
+        origin, goal = source / kind / f"{run}{suffix}", target / kind / f"{name}{suffix}"
+        if origin.is_dir():
+            shutil.copytree(origin, goal, dirs_exist_ok=True)
+        elif origin.exists():
+            goal.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(origin, goal)
 
 
 def _check(result: Result) -> None:

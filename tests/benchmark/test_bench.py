@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
+import shutil
 import subprocess
 import sys
 import time
@@ -92,6 +93,32 @@ def test_results_of_other_folders_are_taken_over(tmp_path, capsys):
     main(["bench", "smoke", "--output", str(tmp_path / "here"), "--merge", str(tmp_path / "there")])
     assert "All smoke runs" in capsys.readouterr().out
     assert len(read_all([tmp_path / "here"])[0]) == 5
+
+
+def test_one_training_answers_for_every_name_it_goes_by(tmp_path, capsys):
+    path = tmp_path / "twice.yaml"
+    path.write_text(
+        "scenes: [{data: demo, model: {num_downscales: 0}}]\n"
+        "parts: [{methods: [paper, l1-0.05, l1-0.01], effects: [dashboard], steps: 5}]"
+    )
+    runs = {run.method: run for run in plan(read_benchmark(str(path)))}
+    assert runs["paper"].training == runs["l1-0.05"].training
+    assert runs["paper"].training != runs["l1-0.01"].training
+    known = folder_of(tmp_path / "out", [result(runs["l1-0.01"])])
+    (known / "pictures" / runs["l1-0.01"].id).mkdir(parents=True)
+    main(["bench", str(path), "--output", str(known), "--only", "*-paper-adc-*", "*-l1-0.05-*"])
+    found = {each.run.method: each for each in read_all([known])[0]}
+    assert set(found) == {"paper", "l1-0.05", "l1-0.01"}
+    assert (found["paper"].same_as, found["l1-0.05"].same_as) == ("", runs["paper"].id)
+    assert found["paper"].views == found["l1-0.05"].views != {}
+    pictures = [sorted(p.name for p in (known / "pictures" / runs[m].id).iterdir()) for m in ("paper", "l1-0.05")]
+    assert pictures[0] == pictures[1] != []
+    # Known from an earlier call: nothing is trained at all.
+    (known / "results" / f"{runs['paper'].id}.json").unlink()
+    shutil.rmtree(known / "scenes")
+    main(["bench", str(path), "--output", str(known), "--only", "*-paper-adc-*"])
+    assert {each.run.method for each in read_all([known])[0]} == set(found)
+    assert not (known / "scenes").exists()
 
 
 def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monkeypatch, capsys):

@@ -186,6 +186,13 @@ def test_runs_of_several_revisions_are_pointed_out(tmp_path):
     assert "several revisions" in (tmp_path / "report" / "report.md").read_text()
 
 
+def test_a_training_under_two_names_is_pointed_out(tmp_path):
+    results = all_results()
+    folder_of(tmp_path, [*results[1:], dataclasses.replace(results[0], same_as=results[1].run.id)])
+    report([tmp_path], tmp_path / "report")
+    assert "1 of them are the trainings of others" in (tmp_path / "report" / "report.md").read_text()
+
+
 def test_the_page_escapes_what_it_shows_and_holds_its_pictures(tmp_path):
     results = all_results()[:1]
     results.append(dataclasses.replace(all_results()[1], status="failed", reason="<script>alert(1)</script>"))
