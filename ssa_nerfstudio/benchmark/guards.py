@@ -7,7 +7,6 @@ to the end, which are few, so that what the guards add weighs most. Prints the r
 
 from __future__ import annotations
 
-import copy
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,6 @@ import numpy as np
 import torch
 import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
-from nerfstudio.engine.optimizers import Optimizers
 
 from ssa_nerfstudio.benchmark.run import configure, versions
 from ssa_nerfstudio.errors import refuse
@@ -92,15 +90,12 @@ class Training:
 
     def __init__(self, trainer: SSATrainer) -> None:
         self.trainer, self.steps = trainer, 0
-        self._guard, self._guarded = trainer.guard, trainer.optimizers
-        self._plain = copy.copy(trainer.optimizers)
-        self._plain.__class__ = Optimizers  # nerfstudio's, which hold the same optimisers
+        self._guard = trainer.optimizers.guard
 
     def switch(self, guarded: bool) -> None:
         """Do as from the start with `guards` in the configuration."""
         trainer, model = self.trainer, self.trainer.pipeline.model
-        trainer.guard = self._guard if guarded else None
-        trainer.optimizers = self._guarded if guarded else self._plain
+        trainer.optimizers.guard = self._guard if guarded else None
         model.config.guards = model.strategy.guarded = guarded
         model.info = {}
         for optimizer in trainer.optimizers.optimizers.values():

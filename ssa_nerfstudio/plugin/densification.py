@@ -59,14 +59,15 @@ class AdaptiveDensityControl(DefaultStrategy):
         # Gradients with respect to coordinates that run over [-1, 1] across the image.
         half = 0.5 * info["n_cameras"]
         norms = torch.hypot(gradients[..., 0] * (half * info["width"]), gradients[..., 1] * (half * info["height"]))
-        radii = info["radii"]  # [C, N]
-        if self.guarded and info.get("taken") is not None:
-            radii = radii * info["taken"]
-        visible = radii > 0
+        radii, least = info["radii"], 0  # [C, N]
+        if self.guarded and info.get("skipped") is not None:
+            # The float 1 of a skipped step is 0x3f800000 as an integer: no radius is larger, nothing counts as visible.
+            least = info["skipped"].view(torch.int32)
+        visible = radii > least
         state["grad2d"] += torch.where(visible, norms, torch.zeros_like(norms)).sum(dim=0)
         state["count"] += visible.sum(dim=0)
         if self.refine_scale2d_stop_iter > 0:
-            radii = radii.amax(dim=0) / float(max(info["width"], info["height"]))
+            radii = torch.where(visible, radii, 0).amax(dim=0) / float(max(info["width"], info["height"]))
             torch.maximum(state["radii"], radii, out=state["radii"])
 
     @torch.no_grad()
@@ -106,9 +107,9 @@ class MarkovChainMonteCarlo(MCMCStrategy):
         packed: bool = False,
     ) -> None:
         """Relocate, add and perturb; the noise follows the current learning rate of the means."""
-        lr = optimizers["means"].param_groups[0]["lr"]
-        if self.guarded and info.get("taken") is not None:
-            lr = lr * info["taken"]
+        lr: Any = optimizers["means"].param_groups[0]["lr"]
+        if self.guarded and info.get("skipped") is not None:
+            lr = torch.rsub(info["skipped"], lr, alpha=lr)
         super().step_post_backward(params, optimizers, state, step, info, lr=lr)
 
     @torch.no_grad()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -53,7 +55,7 @@ class FusedAdam(torch.optim.Adam):
         if overflow is not None:
             refused = overflow if refused is None else torch.maximum(overflow, refused)
         if not self.counted:
-            count_steps(self.counters(), None if refused is None else 1 - refused)
+            count_steps(self.counters(), 1 if refused is None else 1 - refused)
         self.counted = False
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
@@ -87,11 +89,36 @@ class FusedAdam(torch.optim.Adam):
         return state
 
 
-def count_steps(counters: list[Tensor], taken: Tensor | None) -> None:
-    """Add 1 to numbers of steps, or what is `taken` [], on the device; in one kernel.
-
-    A list of it, because torch would read a tensor without dimensions from the device to use it as a number.
-    """
+def count_steps(counters: list[Tensor], more: int | Tensor) -> None:
+    """Add so many to numbers of steps on the device, in one kernel; of a tensor [] the host does not ask which."""
     if counters:
-        more = 1 if taken is None else [taken.reshape(())] * len(counters)
-        torch._foreach_add_(counters, more)  # pyright: ignore[reportPrivateImportUsage]
+        # A list, because torch would read a tensor without dimensions from the device to use it as a number.
+        added = more if isinstance(more, int) else [more.reshape(())] * len(counters)
+        torch._foreach_add_(counters, added)  # pyright: ignore[reportPrivateImportUsage]
+
+
+@torch.no_grad()
+def thaw(optimizers: Mapping[str, torch.optim.Optimizer]) -> list[str]:
+    """Let elements move again whose second moment is infinite; the host waits for the device.
+
+    A finite gradient above 1.8e19 has a square that float32 does not hold: Adam's second moment is infinite from then
+    on, and its element stands still, with nothing to see of it in values or gradients.
+
+    Returns:
+        The names of the optimisers that had such elements.
+    """
+    moments = [
+        (name, state["exp_avg"], state["exp_avg_sq"])
+        for name, optimizer in optimizers.items()
+        for state in optimizer.state.values()
+        if "exp_avg_sq" in state
+    ]
+    if not moments:
+        return []
+    norms = torch._foreach_norm([second for *_, second in moments], math.inf)  # pyright: ignore[reportPrivateImportUsage]
+    frozen = [moment for moment, norm in zip(moments, torch.stack(norms).tolist(), strict=True) if norm == math.inf]
+    for _, first, second in frozen:
+        infinite = torch.isinf(second)
+        first.masked_fill_(infinite, 0.0)
+        second.masked_fill_(infinite, 0.0)
+    return sorted({name for name, *_ in frozen})

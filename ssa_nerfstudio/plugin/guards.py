@@ -7,16 +7,15 @@ configuration takes all of it away.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import torch
-from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
 from ssa_nerfstudio.errors import give_up, warn
-from ssa_nerfstudio.plugin.fused_adam import FusedAdam, count_steps
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 READ_EVERY = 100
@@ -36,11 +35,7 @@ LONELY_SIZE = 0.01
 
 
 class StepGuard:
-    """Decides on the device whether a step may be taken: only where the loss and every gradient's norm are finite.
-
-    The norm and not the largest value, because a gradient whose square overflows turns Adam's second moment into
-    infinity, after which that element never moves again.
-    """
+    """Decides on the device whether a step may be taken: only where the loss and every gradient are finite."""
 
     def __init__(self, limit: int) -> None:
         """Make a guard.
@@ -51,39 +46,35 @@ class StepGuard:
         self.limit = limit
         self.skipped: Tensor | None = None
         """1 where the current step is skipped, else 0: one float tensor on the device; None before the first step."""
-        self.taken: Tensor | None = None
-        """1 - skipped."""
         self._optimizers: Mapping[str, torch.optim.Optimizer] = {}
-        self._skips: list[Tensor] = []
-        self._noted: list[tuple[int, list[bool], Sequence[Tensor]]] = []
-        """Of each step: how many terms the loss had, which parameters had a gradient, and the norms of all of them."""
-        self._row, self._row_began, self._culprits = 0, 0, ""
+        self._losses: Sequence[Tensor] = ()
+        self._judged = 0
+        """Steps since the last look."""
+        self._row, self._row_began = 0, 0
 
     def judge(self, losses: Sequence[Tensor], optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
         """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device.
 
         Args:
-            losses: the terms of the loss, scalars.
+            losses: the terms of the loss, detached scalars.
             optimizers: by name.
         """
-        if len(self._noted) == len(self._skips):
-            self._skips += losses[0].new_zeros(READ_EVERY, dtype=torch.float32).unbind()
+        if self._judged == 0:
+            self._skips = losses[0].new_zeros(READ_EVERY, dtype=torch.float32)
+            self._skip = self._skips.unbind()
             self._one = losses[0].new_ones((), dtype=torch.float32)
-        self._optimizers = optimizers
-        # Not from a list of old: densification puts new parameters into the optimisers. Names are found where needed.
+        self._optimizers, self._losses = optimizers, losses
+        # Not from a list of old: densification puts new parameters into the optimisers.
         gradients = [p.grad for o in optimizers.values() for group in o.param_groups for p in group["params"]]
-        values = [*losses, *(gradient for gradient in gradients if gradient is not None)]
-        norms = torch._foreach_norm(values)  # pyright: ignore[reportPrivateImportUsage]
-        self.skipped = self._skips[len(self._noted)]
-        # Sets `skipped` to 1 where a norm is not finite; multiplies the norms by one.
+        self.skipped = self._skip[self._judged]
+        self._judged += 1
+        # Sets `skipped` to 1 where a value is not finite, and multiplies all of them by one: torch's only kernel that
+        # goes through a list of tensors and leaves a single number.
         search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
-        search(norms, self.skipped, self._one)
-        self.taken = 1 - self.skipped
-        self._noted.append((len(losses), [gradient is not None for gradient in gradients], norms))
-        fused = [optimizer for optimizer in optimizers.values() if isinstance(optimizer, FusedAdam)]
-        count_steps([counter for optimizer in fused for counter in optimizer.counters()], self.taken)
-        for optimizer in fused:
-            optimizer.refused, optimizer.counted = self.skipped, True
+        search([*self._losses, *(gradient for gradient in gradients if gradient is not None)], self.skipped, self._one)
+        for optimizer in optimizers.values():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.refused = self.skipped
 
     def watch(self, optimizer: torch.optim.Optimizer) -> None:
         """Let an optimiser take no step that was judged to be skipped."""
@@ -107,68 +98,49 @@ class StepGuard:
                     parameter.grad = None
 
     def look(self, step: int) -> int:
-        """Read what was noted since the last look: the number of skipped steps.
+        """Read what became of the steps since the last look: the number of skipped ones.
 
         Raises:
             TrainingFailed: where `limit` steps in a row, up to any of them, were skipped.
         """
-        noted, self._noted = self._noted, []
-        skips = torch.stack(self._skips[: len(noted)]).tolist() if noted else []
-        self._skips = []
+        skips = self._skips[: self._judged].tolist() if self._judged else []
+        self._judged = 0
         skipped = int(sum(skips))
-        for at, (skip, of_step) in enumerate(zip(skips, noted, strict=True), start=step + 1 - len(noted)):
+        if not skipped:
+            self._row = 0
+            return 0
+        # The gradients of the last step are still there; of earlier ones nothing but that they were skipped.
+        culprits = self._culprits() if skips[-1] else "the loss or a gradient was"
+        for at, skip in enumerate(skips, start=step + 1 - len(skips)):
             if not skip:
                 self._row = 0
                 continue
             if self._row == 0:
-                self._row_began, self._culprits = at, self._described(*of_step)
+                self._row_began = at
             self._row += 1
             if self._row >= self.limit:
                 raise give_up(
                     f"training stopped at step {step}: {self.limit} steps in a row, from step {self._row_began} on, "
-                    f"were skipped because {self._culprits} not finite; resume from an earlier checkpoint (--load-dir) "
+                    f"were skipped because {culprits} not finite; resume from an earlier checkpoint (--load-dir) "
                     "with lower learning rates"
                 )
-        if skipped:
-            warn(f"{skipped} of the {len(noted)} steps up to {step} were skipped: {self._culprits} not finite")
+        warn(f"{skipped} of the {len(skips)} steps up to {step} were skipped: {culprits} not finite")
         return skipped
 
-    def _described(self, terms: int, present: list[bool], norms: Sequence[Tensor]) -> str:
-        """What was not finite: "the loss", "the gradient of scales", and the parameters that are so themselves."""
+    def _culprits(self) -> str:
+        """What is not finite: "the loss", "the gradient of scales", and the parameters that are so themselves."""
         parameters = list(_parameters(self._optimizers))
         values = [name for name, p in parameters if not torch.isfinite(p).all()]
         if values:
             return f"{', '.join(values)} (the values themselves) and what follows from them were"
-        names = [THE_LOSS] * terms + [name for (name, _), there in zip(parameters, present, strict=True) if there]
-        broken = [name for name, norm in zip(names, norms, strict=True) if not math.isfinite(norm)]
-        gradients = [name for name in broken if name != THE_LOSS]
-        parts = [THE_LOSS] * (THE_LOSS in broken)
-        if len(gradients) == sum(present):
+        present = [name for name, p in parameters if p.grad is not None]
+        broken = [name for name, p in parameters if p.grad is not None and not torch.isfinite(p.grad).all()]
+        parts = [THE_LOSS] * (not all(torch.isfinite(loss) for loss in self._losses))
+        if broken == present:
             parts.append("every gradient")
-        elif gradients:
-            parts.append(f"the gradient of {', '.join(gradients)}")
+        elif broken:
+            parts.append(f"the gradient of {', '.join(broken)}")
         return f"{' and '.join(parts)} {'was' if len(parts) == 1 else 'were'}"
-
-
-class GuardedOptimizers(Optimizers):
-    """nerfstudio's optimisers, which take a step all together or not at all."""
-
-    def __init__(
-        self,
-        config: dict[str, Any],
-        param_groups: dict[str, list[Parameter]],
-        guard: StepGuard,
-        losses: Callable[[], Sequence[Tensor]],
-    ) -> None:
-        super().__init__(config, param_groups)
-        self.guard, self._losses = guard, losses
-        for optimizer in self.optimizers.values():
-            guard.watch(optimizer)
-
-    def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
-        """Judge the step, then step the groups."""
-        self.guard.judge(self._losses(), {name: self.optimizers[name] for name in param_groups})
-        super().optimizer_scaler_step_some(grad_scaler, param_groups)
 
 
 def _forget(optimizer: torch.optim.Optimizer, *_: Any) -> None:

@@ -9,15 +9,15 @@ from typing import Literal
 
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.errors import give_up, refuse, warn
 from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
-from ssa_nerfstudio.plugin.guards import READ_EVERY, GuardedOptimizers, StepGuard, first_not_finite
+from ssa_nerfstudio.plugin.guards import READ_EVERY, StepGuard, first_not_finite
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
+from ssa_nerfstudio.plugin.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.schedules import scaled
 
@@ -39,7 +39,7 @@ class SSATrainer(Trainer):
 
     config: SSATrainerConfig
     pipeline: SSAPipeline
-    guard: StepGuard | None = None
+    optimizers: JointOptimizers
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         check_device(config.machine.device_type)
@@ -59,7 +59,7 @@ class SSATrainer(Trainer):
         usable = (path for path in candidates if damage(path) is None and saved_pipeline(path) is not None)
         return next(usable, candidates[0])
 
-    def setup_optimizers(self) -> Optimizers:
+    def setup_optimizers(self) -> JointOptimizers:
         """Optimisers of the configuration; the means' learning rate in units of the scene where the model asks so."""
         self.pipeline.model.metrics_every = max(1, self.config.logging.steps_per_log)
         scale = self.pipeline.model.scene_scale
@@ -67,11 +67,10 @@ class SSATrainer(Trainer):
             means = self.config.optimizers["means"]
             means["optimizer"].lr *= scale
             means["scheduler"].lr_final *= scale
-        if not self.config.pipeline.model.guards:
-            return super().setup_optimizers()
-        self.guard = StepGuard(self.config.pipeline.model.max_skipped_steps)
+        model = self.config.pipeline.model
+        guard = StepGuard(model.max_skipped_steps) if model.guards else None
         groups = self.pipeline.get_param_groups()
-        return GuardedOptimizers(self.config.optimizers.copy(), groups, self.guard, lambda: self.pipeline.losses)
+        return JointOptimizers(self.config.optimizers.copy(), groups, guard, lambda: self.pipeline.losses)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as upstream does, and say at the end of the training what became of the artifact.
@@ -126,8 +125,7 @@ class SSATrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint, whole and finite or not at all; older ones go only when it is there."""
-        if self.guard is not None:
-            self.guard.look(step)
+        self.optimizers.look(step)
         states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
         broken = first_not_finite({**self.pipeline.state_dict(), **states})
         if broken is not None:
@@ -156,10 +154,10 @@ class SSATrainer(Trainer):
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""
         loss, losses, metrics = super().train_iteration(step)
-        if self.guard is not None:
-            self.pipeline.model.info["taken"] = self.guard.taken
+        if self.optimizers.guard is not None:
+            self.pipeline.model.info["skipped"] = self.optimizers.guard.skipped
             if (step + 1) % READ_EVERY == 0:
-                self.guard.look(step)
+                self.optimizers.look(step)
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:

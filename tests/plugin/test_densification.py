@@ -188,7 +188,7 @@ def test_noise_is_left_out_of_a_skipped_step():
         params["opacities"].data[:] = -6.0
         before = params["means"].detach().clone()
         strategy = MarkovChainMonteCarlo(refine_start_iter=100)
-        info = {"taken": torch.tensor(1 - skipped)}
+        info = {"skipped": torch.tensor(skipped)}
         strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, info)
         moved.append((params["means"] - before).abs().max().item())
     assert moved[0] > 0

@@ -18,7 +18,14 @@ from ssa_nerfstudio.benchmark.run import configure
 from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.fused_adam import FusedAdam
-from ssa_nerfstudio.plugin.guards import RANGE_EVERY, SCALE_RANGE, StepGuard, first_not_finite, keep_scales_in_range
+from ssa_nerfstudio.plugin.guards import (
+    RANGE_EVERY,
+    READ_EVERY,
+    SCALE_RANGE,
+    StepGuard,
+    first_not_finite,
+    keep_scales_in_range,
+)
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 OVERLAYS = pytest.mark.parametrize("overlay", ["on", "off"])
@@ -89,10 +96,17 @@ def test_a_step_that_is_not_finite_leaves_everything_as_it_was(tiny_scene, tmp_p
     trainer.train()
     before, after = states[1], states[2]
     assert before.keys() == after.keys()
-    assert [name for name in before if not torch.equal(before[name], after[name])] == []
-    moved = [name for name in before if not torch.equal(after[name], states[3][name])]
-    assert {"_model.gauss_params.means", "means.0.exp_avg", "means.0.step", "grad2d", "count"} <= set(moved)
+    assert changed(before, after) == set()
+    assert {"_model.gauss_params.means", "means.0.exp_avg", "grad2d", "count"} <= changed(after, states[3])
     assert first_not_finite(states[3]) is None
+    # Adam's numbers of steps are put right when the host looks, here for the checkpoint at the end.
+    assert {int(v) for name, v in state(trainer).items() if name.endswith(".step")} == {3}
+
+
+def changed(before: dict[str, Tensor], after: dict[str, Tensor]) -> set[str]:
+    """What differs, but for Adam's numbers of steps."""
+    names = {name for name in before if not name.endswith(".step")}
+    return {name for name in names if not torch.equal(before[name], after[name])}
 
 
 class Operations(TorchDispatchMode):
@@ -129,7 +143,7 @@ def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_pa
     assert more["item"] == 0
     launched = more.total() - more["view"] - more["detach"] - more["alias"]
     fewer = counts[False] - counts[True]
-    assert launched - fewer.total() <= 4
+    assert launched - fewer.total() <= (3 if "mcmc" in method else 1)
 
 
 @OVERLAYS
@@ -168,22 +182,22 @@ def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_gua
     assert not torch.isfinite(sums[False][2]["grad2d"]).all()
 
 
-def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_its_element():
-    parameter = torch.nn.Parameter(torch.zeros(3))
-    optimizer = FusedAdam([parameter], lr=0.1, eps=1e-15)
-    frozen = torch.nn.Parameter(torch.zeros(3))
-    plain = torch.optim.Adam([frozen], lr=0.1, fused=True, eps=1e-15)
-    guard = StepGuard(limit=10)
-    guard.watch(optimizer)
-    for largest in (1e22, 1.0, 1.0):
-        gradient = torch.tensor([largest, 1.0, 1.0])
-        parameter.grad, frozen.grad = gradient.clone(), gradient.clone()
-        guard.judge([torch.tensor(1.0)], {"p": optimizer})
-        optimizer.step()
-        plain.step()
-    torch.testing.assert_close(parameter.detach(), torch.full((3,), -0.2))
-    assert abs(frozen.detach()[0]) < 0.11
-    assert torch.isinf(plain.state[frozen]["exp_avg_sq"][0])
+@pytest.mark.parametrize("guards", [True, False])
+def test_a_gradient_whose_square_overflows_freezes_its_element_until_the_next_look(
+    tiny_scene, tmp_path, capsys, guards
+):
+    trainer = make(tiny_scene, tmp_path, steps=READ_EVERY + 20, overlay="off", guards=guards, stop_split_at=1)
+    spoil(trainer, {2}, "means", 1e22)
+    states = after_each_step(trainer)
+    if guards:
+        trainer.train()
+    else:
+        with pytest.raises(TrainingFailed, match="exp_avg_sq"):
+            trainer.train()
+    means = [step["_model.gauss_params.means"][0, 0] for step in states]
+    assert means[READ_EVERY - 1] == means[1] != means[0]
+    assert (means[-1] != means[1]) == guards
+    assert ("gradients of means were too large for their squares" in capsys.readouterr().err) == guards
 
 
 @pytest.mark.parametrize("kind", ["ours", "fused", "foreach", "single", "sgd"])
@@ -227,7 +241,7 @@ def test_optimisers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_pa
     spoil(trainer, {2})
     states = after_each_step(trainer)
     trainer.train()
-    assert [name for name in states[1] if not torch.equal(states[1][name], states[2][name])] == []
+    assert changed(states[1], states[2]) == set()
 
 
 @pytest.mark.parametrize("group", ["camera_opt", "bilateral_grid"])
@@ -238,7 +252,7 @@ def test_cameras_and_bilateral_grids_skip_with_the_rest(tiny_scene, tmp_path, gr
     spoil(trainer, {2}, group)
     states = after_each_step(trainer)
     trainer.train()
-    assert [name for name in states[1] if not torch.equal(states[1][name], states[2][name])] == []
+    assert changed(states[1], states[2]) == set()
 
 
 @OVERLAYS
@@ -255,10 +269,24 @@ def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny
 
 
 def test_skipped_steps_that_are_not_in_a_row_are_told_and_endured(tiny_scene, tmp_path, capsys):
-    trainer = make(tiny_scene, tmp_path, steps=100, max_skipped_steps=3, stop_split_at=1)
-    spoil(trainer, set(range(0, 100, 3)) | set(range(1, 100, 3)), "quats")
+    trainer = make(tiny_scene, tmp_path, steps=200, max_skipped_steps=3, stop_split_at=1)
+    spoil(trainer, set(range(0, 200, 3)) | set(range(2, 200, 3)), "quats")
     trainer.train()
-    assert "67 of the 100 steps up to 99 were skipped: the gradient of quats was not finite" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "67 of the 100 steps up to 99 were skipped: the gradient of quats was not finite" in told
+    # The 200th was taken, and left no trace of what was wrong with those before.
+    assert "66 of the 100 steps up to 199 were skipped: the loss or a gradient was not finite" in told
+
+
+def test_if_all_breaks_all_is_named():
+    guard = StepGuard(limit=1)
+    parameters = [torch.nn.Parameter(torch.ones(2)) for _ in range(3)]
+    optimizers = {name: torch.optim.SGD([p], lr=1.0) for name, p in zip("abc", parameters, strict=True)}
+    for parameter in parameters[:2]:  # the third has none
+        parameter.grad = torch.full((2,), math.inf)
+    guard.judge([torch.tensor(math.nan)], optimizers)
+    with pytest.raises(TrainingFailed, match="because the loss and every gradient were not finite"):
+        guard.look(0)
 
 
 def test_a_row_of_skipped_steps_is_counted_across_looks():
@@ -400,7 +428,7 @@ def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys):
     trainer = make(tiny_scene, tmp_path, steps=2)
     trainer.train()
     means = trainer.optimizers.optimizers["means"]
-    means.state[means.param_groups[0]["params"][0]]["exp_avg_sq"][0] = math.inf
+    means.state[means.param_groups[0]["params"][0]]["exp_avg_sq"][0] = math.nan
     with pytest.raises(TrainingFailed):
         trainer.save_checkpoint(7)
     assert "means.state.0.exp_avg_sq" in capsys.readouterr().err
