@@ -56,19 +56,20 @@ class AdaptiveDensityControl(DefaultStrategy):
             state["count"] = gradients.new_zeros(gradients.shape[1])
         if self.refine_scale2d_stop_iter > 0 and state["radii"] is None:
             state["radii"] = gradients.new_zeros(gradients.shape[1])
-        # Gradients with respect to coordinates that run over [-1, 1] across the image.
-        half = 0.5 * info["n_cameras"]
-        norms = torch.hypot(gradients[..., 0] * (half * info["width"]), gradients[..., 1] * (half * info["height"]))
-        radii, least = info["radii"], 0  # [C, N]
+        least = 0
         if self.guarded and info.get("skipped") is not None:
             # The float 1 of a skipped step is 0x3f800000 as an integer: no radius is larger, nothing counts as visible.
             least = info["skipped"].view(torch.int32)
-        visible = radii > least
-        state["grad2d"] += torch.where(visible, norms, torch.zeros_like(norms)).sum(dim=0)
-        state["count"] += visible.sum(dim=0)
-        if self.refine_scale2d_stop_iter > 0:
-            radii = torch.where(visible, radii, 0).amax(dim=0) / float(max(info["width"], info["height"]))
-            torch.maximum(state["radii"], radii, out=state["radii"])
+        width, height = info["width"], info["height"]
+        for gradient, radii in zip(gradients, info["radii"], strict=True):  # a camera's [N, 2], [N]
+            visible = radii > least
+            # With respect to coordinates that run over [-1, 1] across the image.
+            norms = torch.hypot(gradient[:, 0], gradient[:, 1] * (height / width))
+            state["grad2d"].add_(torch.where(visible, norms, 0.0), alpha=0.5 * info["n_cameras"] * width)
+            state["count"] += visible
+            if self.refine_scale2d_stop_iter > 0:
+                sizes = torch.where(visible, radii, 0) / float(max(width, height))
+                torch.maximum(state["radii"], sizes, out=state["radii"])
 
     @torch.no_grad()
     def _prune_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any], step: int):
