@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.overlay.area import StaticArea
+from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats, paint
 from ssa_nerfstudio.overlay.resampling import letterbox, reduced_size, stack_premultiplied, to_training_scale
 from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
@@ -58,7 +59,7 @@ class ScreenSpaceOverlay(nn.Module):
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.register_buffer("near", torch.ones(*size, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
-        self._held: tuple[Tensor, ...] = ()
+        self._held: list[tuple[Tensor, Tensor]] = []
 
     @torch.no_grad()
     def start_from(self, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
@@ -121,9 +122,9 @@ class ScreenSpaceOverlay(nn.Module):
         What the scene has learned by itself when the wait is over, the overlay gains nothing by taking.
         """
         if not waiting:
-            self._held = ()
+            self._held = []
         elif not self._held:
-            self._held = tuple(parameter.clone() for parameter in self.parameters())
+            self._held = [(p.clone(), (self.near > 0).expand_as(p)) for p in self.parameters()]
 
     @torch.no_grad()
     def take_back(self) -> None:
@@ -132,8 +133,8 @@ class ScreenSpaceOverlay(nn.Module):
         Rather than to let no gradient through: Adam would not know its size when the wait is over, and start with steps
         six times too large.
         """
-        for parameter, held in zip(self.parameters(), self._held, strict=False):
-            parameter.copy_(torch.where(self.near > 0, parameter, held))
+        for parameter, (held, near) in zip(self.parameters(), self._held, strict=False):
+            torch.where(near, parameter, held, out=parameter)
 
     @torch.no_grad()
     def keep_in_range(self) -> None:
@@ -154,6 +155,21 @@ class ScreenSpaceOverlay(nn.Module):
         if self.adds_light:
             return torch.sigmoid(torch.maximum(self.alpha_logits, self.color_logits.amax(dim=-1, keepdim=True)))
         return self.matte()
+
+    def in_front_of(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """What a photo shows of a render: I = T C + B.
+
+        Args:
+            clean: [H // reduction, W // reduction, 3], the render with its background.
+            reduction: 1, 2 or 4: training images are reduced by this.
+            behind: opacity of the splats [..., 1] and colour of the background [3], which the matte then gains nothing
+                by hiding (`composite_over_splats`); None: plain compositing.
+        """
+        if self.resolution == reduction == 1 and not self.adds_light:
+            return paint(clean, self.color_logits, self.alpha_logits, behind)
+        if behind is None:
+            return composite(clean, *self.layers(reduction))
+        return composite_over_splats(clean, *behind, *self.layers(reduction))
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """Transmittance [H // reduction, W // reduction, 1] and added light [..., 3], averaged premultiplied.
@@ -197,6 +213,10 @@ class GivenOverlay(nn.Module):
         self.register_buffer("addition", addition.float())
         self.height, self.width = transmittance.shape[:2]
         self.register_buffer("frame", torch.tensor([self.height, self.width, 1, 0]))
+
+    def in_front_of(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """As `ScreenSpaceOverlay.in_front_of`; there is no matte that could gain anything."""
+        return composite(clean, *self.layers(reduction))
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """T and B [H // reduction, W // reduction, 3], averaged."""

@@ -82,10 +82,10 @@ class Artifacts(nn.Module):
         """The overlays that have parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
 
-    def layers_of_view(self, view: int, reduction: int) -> tuple[Tensor, Tensor] | None:
-        """Transmittance and added light in front of a training view, at 1 / reduction of its size; None: nothing is."""
+    def of_view(self, view: int) -> Overlay | None:
+        """What is in front of a training view; None: nothing."""
         group = self._group_of_view[view]
-        return None if group is None else self[group].layers(reduction)
+        return None if group is None else self[group]
 
     def layers_of_camera(
         self, camera: Cameras, width: int, height: int, group: int | None = None

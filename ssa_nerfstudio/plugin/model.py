@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
+import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
@@ -16,7 +17,7 @@ from torch.nn import Parameter
 
 from ssa_nerfstudio import metrics
 from ssa_nerfstudio.errors import warn
-from ssa_nerfstudio.overlay.compositing import clipped, composite, composite_over_splats
+from ssa_nerfstudio.overlay.compositing import clipped, composite
 from ssa_nerfstudio.overlay.losses import Sparsity, SSIMBody, photometric, sparsity
 from ssa_nerfstudio.overlay.pictures import over_checkerboard
 from ssa_nerfstudio.overlay.resampling import straight_color
@@ -226,22 +227,19 @@ class SSASplatfactoModel(SplatfactoModel):
         if in_viewer():
             return self._controls.outputs(drawn, camera, width, height)
         if self.training:
-            layers = self.artifacts.layers_of_view(metadata(camera)["cam_idx"], reduction)
+            overlay = self.artifacts.of_view(metadata(camera)["cam_idx"])
+            if overlay is None:
+                return drawn
+            behind = (drawn["accumulation"], drawn["background"]) if self.config.ignore_background else None
+            drawn["composite"] = overlay.in_front_of(drawn["rgb"], reduction, behind)
         else:
             layers = self.artifacts.layers_of_camera(camera, width, height)
-        if layers is None:
-            return drawn
-        transmittance, addition = layers
-        if self.training and self.config.ignore_background and self.artifacts.learned():
-            drawn["composite"] = composite_over_splats(
-                drawn["rgb"], drawn["accumulation"], drawn["background"], transmittance, addition
-            )
-        else:
-            drawn["composite"] = composite(drawn["rgb"], transmittance, addition)
+            if layers is None:
+                return drawn
+            drawn["composite"] = composite(drawn["rgb"], *layers)
+            drawn["overlay_rgb"], drawn["overlay_alpha"] = straight_color(*layers)
         if self.artifacts.exceed_white:
             drawn["composite"] = clipped(drawn["composite"])
-        if not self.training:
-            drawn["overlay_rgb"], drawn["overlay_alpha"] = straight_color(transmittance, addition)
         return drawn
 
     def _render(self, camera: Cameras, width: int, height: int, reduction: int) -> dict[str, Any]:
@@ -280,16 +278,21 @@ class SSASplatfactoModel(SplatfactoModel):
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
         background = self._get_background_color()
-        rgb = torch.clamp(render[0, ..., :3] + (1.0 - alpha[0]) * background, 0.0, 1.0)
+        # Views whose gradient is a view: an index or a slice fills a frame with zeros first. Hence hardtanh, too, whose
+        # gradient is one kernel; clamp's are five.
+        accumulation, color = alpha.squeeze(0), render.squeeze(0)
+        if with_depth:
+            color = color[..., :3]
+        rgb = F.hardtanh(torch.addcmul(color, 1.0 - accumulation, background), 0.0, 1.0)
         if self.config.use_bilateral_grid and self.training:
             rgb = self._apply_bilateral_grid(rgb[None], metadata(camera)["cam_idx"], height, width)[0]
         depth = None
         if with_depth:
-            depth = torch.where(alpha[0] > 0, render[0, ..., 3:], render[..., 3].detach().max())
+            depth = torch.where(accumulation > 0, render[0, ..., 3:], render[..., 3].detach().max())
         return {
             "rgb": rgb,
             "depth": depth,
-            "accumulation": alpha[0],
+            "accumulation": accumulation,
             "background": background if self.training else background.expand(height, width, 3),
         }
 
@@ -301,6 +304,10 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.camera_optimizer.config.mode == "off" and prepared is not None:
             return prepared
         return view_matrix(self.camera_optimizer.apply_to_camera(camera))
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """A photo in [0, 1]: as upstream's, to the last bit, in one pass over 8 bits instead of two."""
+        return super().get_gt_img(torch.div(image, 255.0) if image.dtype == torch.uint8 else image)
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's loss: photometric on what the photo shows, sparsity of the matte, the strategy's own terms."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats
+from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats, paint
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 
@@ -67,3 +68,45 @@ def test_splats_and_colour_get_the_plain_gradient():
         gradients.append((leaf.grad, overlay.color_logits.grad))
     for ours, plain in zip(gradients[1], gradients[0], strict=True):
         torch.testing.assert_close(ours, plain)
+
+
+@pytest.mark.parametrize("over_splats", [True, False])
+def test_painting_by_hand_has_the_values_and_gradients_of_the_layers(over_splats):
+    generator = torch.Generator().manual_seed(0)
+    overlay, _, _, background = scene(0.4)
+    opacity, clean = (torch.rand(4, 5, c, generator=generator, dtype=torch.float64) for c in (1, 3))
+    with torch.no_grad():
+        for parameter in overlay.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    target = torch.rand(4, 5, 3, generator=generator, dtype=torch.float64)
+    behind = (opacity, background) if over_splats else None
+    found = []
+    for by_hand in (True, False):
+        leaf = clean.clone().requires_grad_()
+        overlay.zero_grad()
+        if by_hand:
+            picture = paint(leaf, overlay.color_logits, overlay.alpha_logits, behind)
+        elif behind is None:
+            picture = composite(leaf, *overlay.layers())
+        else:
+            picture = composite_over_splats(leaf, *behind, *overlay.layers())
+        (picture - target).square().sum().backward()
+        found.append((picture.detach(), leaf.grad, overlay.color_logits.grad, overlay.alpha_logits.grad))
+    for ours, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("resolution", [1, 2])
+@pytest.mark.parametrize("reduction", [1, 2])
+@pytest.mark.parametrize("adds_light", [False, True])
+@pytest.mark.parametrize("over_splats", [True, False])
+def test_an_overlay_is_in_front_of_a_render_as_its_layers_say(resolution, reduction, adds_light, over_splats):
+    generator = torch.Generator().manual_seed(1)
+    overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
+    with torch.no_grad():
+        for parameter in overlay.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64)
+    behind = (clean[..., :1], torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)) if over_splats else None
+    shown = overlay.in_front_of(clean, reduction, behind)
+    torch.testing.assert_close(shown, composite(clean, *overlay.layers(reduction)), rtol=0, atol=1e-15)
