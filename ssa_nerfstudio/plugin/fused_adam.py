@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -32,8 +30,6 @@ class FusedAdam(torch.optim.Adam):
 
     refused: Tensor | None = None
     """One number on the device: where it is 1, a step changes nothing. None: every step is taken."""
-    counted: bool = False
-    """Whether the next step is counted already, with those of other optimisers in one kernel (`counters`)."""
 
     def __init__(self, params: Any, **settings: Any) -> None:
         super().__init__(params, fused=True, **settings)
@@ -44,7 +40,7 @@ class FusedAdam(torch.optim.Adam):
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Take a step with the gradients that there are.
+        """Take a step with the gradients that there are, and count it.
 
         Args:
             closure: not supported; as in torch for gradient scaling.
@@ -54,9 +50,16 @@ class FusedAdam(torch.optim.Adam):
         refused = self.refused
         if overflow is not None:
             refused = overflow if refused is None else torch.maximum(overflow, refused)
-        if not self.counted:
-            count_steps(self.counters(), 1 if refused is None else 1 - refused)
-        self.counted = False
+        count_steps(self.counters(), 1 if refused is None else 1 - refused)
+        self.update(refused, scale)
+
+    def update(self, refused: Tensor | None, scale: Tensor | None = None) -> None:
+        """Take a step that is counted already: `step` without torch's hooks and profiler marks. Under `no_grad`.
+
+        Args:
+            refused: one number; where it is 1, nothing changes.
+            scale: one number by which the gradients are too large.
+        """
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
             if not parameters:
@@ -95,30 +98,3 @@ def count_steps(counters: list[Tensor], more: int | Tensor) -> None:
         # A list, because torch would read a tensor without dimensions from the device to use it as a number.
         added = more if isinstance(more, int) else [more.reshape(())] * len(counters)
         torch._foreach_add_(counters, added)  # pyright: ignore[reportPrivateImportUsage]
-
-
-@torch.no_grad()
-def thaw(optimizers: Mapping[str, torch.optim.Optimizer]) -> list[str]:
-    """Let elements move again whose second moment is infinite; the host waits for the device.
-
-    A finite gradient above 1.8e19 has a square that float32 does not hold: Adam's second moment is infinite from then
-    on, and its element stands still, with nothing to see of it in values or gradients.
-
-    Returns:
-        The names of the optimisers that had such elements.
-    """
-    moments = [
-        (name, state["exp_avg"], state["exp_avg_sq"])
-        for name, optimizer in optimizers.items()
-        for state in optimizer.state.values()
-        if "exp_avg_sq" in state
-    ]
-    if not moments:
-        return []
-    norms = torch._foreach_norm([second for *_, second in moments], math.inf)  # pyright: ignore[reportPrivateImportUsage]
-    frozen = [moment for moment, norm in zip(moments, torch.stack(norms).tolist(), strict=True) if norm == math.inf]
-    for _, first, second in frozen:
-        infinite = torch.isinf(second)
-        first.masked_fill_(infinite, 0.0)
-        second.masked_fill_(infinite, 0.0)
-    return sorted({name for name, *_ in frozen})

@@ -35,7 +35,12 @@ LONELY_SIZE = 0.01
 
 
 class StepGuard:
-    """Decides on the device whether a step may be taken: only where the loss and every gradient are finite."""
+    """Decides on the device whether a step may be taken: where the loss and every gradient are finite, and so are the
+    squares of all of them.
+
+    The squares, because one that overflows turns Adam's second moment into infinity, after which that element never
+    moves again, or is not finite at the next step.
+    """
 
     def __init__(self, limit: int) -> None:
         """Make a guard.
@@ -62,16 +67,19 @@ class StepGuard:
         if self._judged == 0:
             self._skips = losses[0].new_zeros(READ_EVERY, dtype=torch.float32)
             self._skip = self._skips.unbind()
-            self._one = losses[0].new_ones((), dtype=torch.float32)
+            self._there_and_back = [losses[0].new_full((), 2.0**k, dtype=torch.float32) for k in (64, -64)]
         self._optimizers, self._losses = optimizers, losses
         # Not from a list of old: densification puts new parameters into the optimisers.
         gradients = [p.grad for o in optimizers.values() for group in o.param_groups for p in group["params"]]
         self.skipped = self._skip[self._judged]
         self._judged += 1
-        # Sets `skipped` to 1 where a value is not finite, and multiplies all of them by one: torch's only kernel that
-        # goes through a list of tensors and leaves a single number.
+        values = [*self._losses, *(gradient for gradient in gradients if gradient is not None)]
+        # torch's only kernel that goes through a list of tensors and leaves a single number: sets `skipped` to 1 where
+        # a value is not finite, and multiplies all of them. By 2^64, and what has no finite square has become infinite
+        # when it is asked the second time; and back, which is exact.
         search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
-        search([*self._losses, *(gradient for gradient in gradients if gradient is not None)], self.skipped, self._one)
+        for factor in self._there_and_back:
+            search(values, self.skipped, factor)
         for optimizer in optimizers.values():
             if isinstance(optimizer, FusedAdam):
                 optimizer.refused = self.skipped

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import torch
 from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio.errors import warn
-from ssa_nerfstudio.plugin.fused_adam import FusedAdam, count_steps, thaw
+from ssa_nerfstudio.plugin.fused_adam import FusedAdam, count_steps
 from ssa_nerfstudio.plugin.guards import StepGuard
 
 
@@ -34,9 +34,17 @@ class JointOptimizers(Optimizers):
         """
         super().__init__(config, param_groups)
         self.guard, self._losses = guard, losses
-        if guard is not None:
-            for optimizer in self.optimizers.values():
+        self._quick: set[str] = set()
+        """Groups of which nothing is asked but to step."""
+        self._counted: list[FusedAdam] = []
+        """Optimisers whose last step was counted whether it was skipped or not."""
+        for name, optimizer in self.optimizers.items():
+            if guard is not None:
                 guard.watch(optimizer)
+            if isinstance(optimizer, FusedAdam) and config[name]["optimizer"].max_norm is None:
+                self._quick.add(name)
+                # What torch's schedulers ask for before their first step; `update` goes round what would say it.
+                optimizer._opt_called = True  # pyright: ignore[reportAttributeAccessIssue]
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
         """Forget gradients; without what torch does around that for its profiler, a tenth of a millisecond in all."""
@@ -46,19 +54,22 @@ class JointOptimizers(Optimizers):
                     parameter.grad = None
 
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
-        """Judge the step, count it, and step the groups."""
+        """Judge the step, and step the groups."""
+        optimizers = {name: self.optimizers[name] for name in param_groups}
         if self.guard is not None:
-            self.guard.judge(self._losses(), {name: self.optimizers[name] for name in param_groups})
-        fused = [self.optimizers[name] for name in param_groups]
-        fused = [optimizer for optimizer in fused if isinstance(optimizer, FusedAdam)]
+            self.guard.judge(self._losses(), optimizers)
+        others = [name for name in param_groups if grad_scaler.is_enabled() or name not in self._quick]
+        self._counted = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
         # Skipped ones too, until the host's next look: to leave them out costs a kernel at every step.
-        count_steps([counter for optimizer in fused for counter in optimizer.counters()], 1)
-        for optimizer in fused:
-            optimizer.counted = True
-        super().optimizer_scaler_step_some(grad_scaler, param_groups)
+        count_steps([counter for optimizer in self._counted for counter in optimizer.counters()], 1)
+        with torch.no_grad():
+            for optimizer in self._counted:
+                optimizer.update(optimizer.refused)
+        if others:
+            super().optimizer_scaler_step_some(grad_scaler, others)
 
     def look(self, step: int) -> None:
-        """Let the host see what the guard noted, and mend what a step that was taken can have broken.
+        """Let the host see what the guard noted, and take skipped steps out of the counts.
 
         Raises:
             TrainingFailed: the guard gives up.
@@ -66,9 +77,5 @@ class JointOptimizers(Optimizers):
         if self.guard is None:
             return
         skipped = self.guard.look(step)
-        fused = [optimizer for optimizer in self.optimizers.values() if isinstance(optimizer, FusedAdam)]
         if skipped:
-            count_steps([counter for optimizer in fused for counter in optimizer.counters()], -skipped)
-        thawed = thaw(self.optimizers)
-        if thawed:
-            warn(f"up to step {step} gradients of {', '.join(thawed)} were too large for their squares; they go on")
+            count_steps([counter for optimizer in self._counted for counter in optimizer.counters()], -skipped)

@@ -55,13 +55,10 @@ def test_steps_that_are_counted_together_are_not_counted_again() -> None:
         parameter.grad = torch.ones(2)
     count_steps([counter for optimizer in optimizers for counter in optimizer.counters()], 1)
     for optimizer in optimizers[:2]:
-        optimizer.counted = True
+        with torch.no_grad():
+            optimizer.update(None)
         optimizer.step()
-        optimizer.step()
-    assert [float(optimizer.state[p]["step"]) for p, optimizer in zip(parameters[:2], optimizers, strict=False)] == [
-        2,
-        2,
-    ]
+    assert [float(optimizers[k].state[parameters[k]]["step"]) for k in (0, 1)] == [2, 2]
     assert parameters[2] not in optimizers[2].state
 
 

@@ -20,7 +20,6 @@ from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.fused_adam import FusedAdam
 from ssa_nerfstudio.plugin.guards import (
     RANGE_EVERY,
-    READ_EVERY,
     SCALE_RANGE,
     StepGuard,
     first_not_finite,
@@ -55,8 +54,8 @@ def spoil(trainer: SSATrainer, steps: set[int] | range, what: str = "scales", va
         outputs, losses, metrics = original(step)
         if step in steps and what == "loss":
             # A loss that is not finite without a gradient that is not: only the loss tells.
-            losses["broken"] = torch.full((), value)
-            pipeline.losses = (*pipeline.losses, torch.tensor(value))
+            losses["broken"] = losses["main_loss"].new_tensor(value)
+            pipeline.losses = (*pipeline.losses, losses["broken"])
         elif step in steps:
             parameter = pipeline.get_param_groups()[what][0]
             poison = torch.zeros_like(parameter)
@@ -143,7 +142,7 @@ def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_pa
     assert more["item"] == 0
     launched = more.total() - more["view"] - more["detach"] - more["alias"]
     fewer = counts[False] - counts[True]
-    assert launched - fewer.total() <= (3 if "mcmc" in method else 1)
+    assert launched - fewer.total() <= (4 if "mcmc" in method else 2)
 
 
 @OVERLAYS
@@ -182,22 +181,35 @@ def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_gua
     assert not torch.isfinite(sums[False][2]["grad2d"]).all()
 
 
-@pytest.mark.parametrize("guards", [True, False])
-def test_a_gradient_whose_square_overflows_freezes_its_element_until_the_next_look(
-    tiny_scene, tmp_path, capsys, guards
-):
-    trainer = make(tiny_scene, tmp_path, steps=READ_EVERY + 20, overlay="off", guards=guards, stop_split_at=1)
-    spoil(trainer, {2}, "means", 1e22)
-    states = after_each_step(trainer)
-    if guards:
-        trainer.train()
-    else:
-        with pytest.raises(TrainingFailed, match="exp_avg_sq"):
-            trainer.train()
-    means = [step["_model.gauss_params.means"][0, 0] for step in states]
-    assert means[READ_EVERY - 1] == means[1] != means[0]
-    assert (means[-1] != means[1]) == guards
-    assert ("gradients of means were too large for their squares" in capsys.readouterr().err) == guards
+def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_or_break_its_element(capsys):
+    parameter = torch.nn.Parameter(torch.zeros(3))
+    optimizer = FusedAdam([parameter], lr=0.1, eps=1e-15)
+    frozen = torch.nn.Parameter(torch.zeros(3))
+    plain = torch.optim.Adam([frozen], lr=0.1, fused=True, eps=1e-15)
+    guard = StepGuard(limit=10)
+    guard.watch(optimizer)
+    for largest in (1.0, 1.0, 1e22):
+        gradient = torch.tensor([largest, 1.0, 1e-42])  # the last one is subnormal
+        parameter.grad, frozen.grad = gradient.clone(), gradient.clone()
+        guard.judge([torch.tensor(1.0)], {"p": optimizer})
+        assert torch.equal(parameter.grad, gradient) == (largest == 1.0)
+        optimizer.step()
+        plain.step()
+    torch.testing.assert_close(parameter.detach()[:2], torch.full((2,), -0.2))
+    assert torch.isinf(plain.state[frozen]["exp_avg_sq"][0])
+    guard.look(2)
+    assert "every gradient was not finite" in capsys.readouterr().err
+
+
+def test_what_has_a_finite_square_is_not_skipped():
+    parameter = torch.nn.Parameter(torch.zeros(2))
+    optimizer = FusedAdam([parameter], lr=0.1)
+    guard = StepGuard(limit=10)
+    for largest, skipped in ((1.8e19, 0), (1.85e19, 1)):
+        parameter.grad = torch.tensor([-largest, 1.0])
+        assert bool(torch.isinf(parameter.grad.square()).any()) == skipped
+        guard.judge([torch.tensor(1.0)], {"p": optimizer})
+        assert guard.skipped == skipped
 
 
 @pytest.mark.parametrize("kind", ["ours", "fused", "foreach", "single", "sgd"])
