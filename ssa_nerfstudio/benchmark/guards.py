@@ -1,8 +1,8 @@
 """What the guards cost: `python -m ssa_nerfstudio.benchmark.guards --data DIR`
 
 Blocks of steps of one training take turns with and without, so that both draw the same Gaussians and a machine that
-drifts drifts for both; the device is waited for between blocks only. Nothing is densified: the start points are drawn
-to the end, which are few, so that what the guards add weighs most. Prints the ratio of the times with its interval.
+drifts drifts for both; the device is waited for between blocks only. The scene grows first and keeps its Gaussians
+then. Prints the ratio of the times with its interval.
 """
 
 from __future__ import annotations
@@ -34,7 +34,9 @@ class Command:
     """One of this plugin's methods."""
     overlay: str = "on"
     """on or off."""
-    pairs: int = 60
+    grow: int = 2_000
+    """Steps of ordinary training before the first block."""
+    pairs: int = 100
     """Pairs of blocks, one with guards and one without; the first two warm up."""
     block: int = READ_EVERY
     """Steps of a block: a multiple of those between two looks of the host, so that every block has as many."""
@@ -47,14 +49,17 @@ class Command:
             raise refuse(f"--block must be a multiple of {READ_EVERY} and --pairs at least 3")
         with TemporaryDirectory() as folder:
             training = self._training(Path(folder))
+            for _ in range(self.grow):
+                training.step()
             times = np.array([self._pair(training, k) for k in range(self.pairs)])[2:]
         percent = 100 * (times[:, 1] / times[:, 0] - 1)
         draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
         low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
         without = 1e3 * np.median(times[:, 0]) / self.block
+        gaussians = training.trainer.pipeline.model.num_points
         print(
-            f"{self.method}, overlay {self.overlay}, {versions()['device']}: {without:.3f} ms a step without guards; "
-            f"with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
+            f"{self.method}, overlay {self.overlay}, {gaussians} Gaussians, {versions()['device']}: {without:.3f} ms a "
+            f"step without guards; with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
         )
 
     def _pair(self, training: Training, pair: int) -> tuple[float, float]:
@@ -64,8 +69,8 @@ class Command:
         return times[False], times[True]
 
     def _training(self, output: Path) -> Training:
-        model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": 0, "mcmc_stop_at": 0}
-        steps = 2 * self.pairs * self.block
+        model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": self.grow, "mcmc_stop_at": self.grow}
+        steps = self.grow + 2 * self.pairs * self.block
         config = configure(self.method, self.data, output, steps, model, self.scale_factor)
         config.scale_schedules = False
         torch.manual_seed(0)
