@@ -25,8 +25,9 @@ from ssa_nerfstudio.benchmark.machine import versions
 from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
-from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
+from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
 
 METHODS: dict[str, SSATrainerConfig] = {

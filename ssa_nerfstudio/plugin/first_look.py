@@ -14,7 +14,7 @@ from ssa_nerfstudio.errors import refuse
 from ssa_nerfstudio.overlay.detection import LEAST_VIEWS, Detection, detect, static_area
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
-from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 
 
 def learned_overlays(

@@ -14,7 +14,7 @@ from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from ssa_nerfstudio.errors import refuse
 
 if TYPE_CHECKING:
-    from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
+    from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 
 MIN_VIEWS = 2
 """An artifact is what does not change from view to view: one view cannot show it."""

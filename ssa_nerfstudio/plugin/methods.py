@@ -10,8 +10,8 @@ from nerfstudio.plugins.types import MethodSpecification
 from ssa_nerfstudio.plugin import open3d_libraries, upstream
 from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
 from ssa_nerfstudio.plugin.fused_adam import FusedAdamConfig
-from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipelineConfig
+from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig, machine
 
 # Every nerfstudio command imports this module through the entry points, before it loads or renders anything.

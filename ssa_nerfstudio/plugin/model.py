@@ -2,91 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
-from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel, SplatfactoModelConfig
+from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio import metrics
 from ssa_nerfstudio.errors import warn
 from ssa_nerfstudio.overlay.compositing import clipped, composite
-from ssa_nerfstudio.overlay.losses import Sparsity, SSIMBody, photometric, sparsity
-from ssa_nerfstudio.overlay.pictures import over_checkerboard
+from ssa_nerfstudio.overlay.losses import photometric, sparsity
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin import guards
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.cameras import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.figures import figures_of_step, figures_of_view, pictures_of_view
+from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.upstream import without_lpips
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, in_viewer
-from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
-
-
-@dataclass
-class SSASplatfactoModelConfig(SplatfactoModelConfig):
-    """Configuration of `SSASplatfactoModel`: splatfacto's, and the artifact's."""
-
-    _target: type = field(default_factory=lambda: SSASplatfactoModel)
-    overlay: Literal["auto", "on", "off", "given"] = "auto"
-    """auto: learn an artifact in front of the cameras that detection finds one in front of, and pay for nothing else;
-    on: learn one in front of every camera; off: plain splatfacto; given: take the true one from overlay_given."""
-    overlay_given: Path | None = None
-    """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
-    (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
-    overlay_start: Literal["detected", "statistics", "constant"] = "detected"
-    """statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); detected: that where nothing shows through,
-    elsewhere what static edges imply; constant: W = 0.5, A = 0.1 (the paper's ablation)."""
-    overlay_light: Literal["auto", "on", "off"] = "auto"
-    """Whether the artifact may add light without hiding the scene (rain, glare), I = (1 - A) C + W: auto asks the
-    photos where overlay_start is detected; off is the paper's I = (1 - A) C + A W."""
-    scene_head_start: int = 4_000
-    """Steps in which the overlay is learned near static edges only, where overlay_start is detected."""
-    overlay_downscale: Literal[1, 2, 4] = 1
-    """The overlay has one pixel for a block of this many pixels a side: 1, 1/2 or 1/4 of the photos' resolution."""
-    sparsity: Sparsity = "log"
-    """What keeps the overlay empty: log (concave, weighted by evidence), l1 (the paper's), off."""
-    sparsity_weight: float = 0.02
-    """Weight of the sparsity term, lambda_sparse, not negative; the paper has 0.05, and 0.01 for mud."""
-    ignore_background: bool = True
-    """The overlay gains nothing by hiding background that no splat covers (a sky without points); the paper's does."""
-    ssim: SSIMBody = "fused"
-    """How the SSIM term is computed; the result is the same. fused: kernels, the fastest; convolution, shifted-sums:
-    plain torch, for comparison."""
-    strategy: Literal["adc", "mcmc"] = "adc"
-    """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
-    cap_max: int = 1_000_000
-    """MCMC: the largest number of Gaussians."""
-    mcmc_stop_at: int = 25_000
-    """MCMC: step after which Gaussians are no longer added or relocated."""
-    mcmc_opacity_start: float = 0.5
-    """MCMC: opacity of the first Gaussians, in (0, 1)."""
-    mcmc_scale_start: float = 0.1
-    """MCMC: size of the first Gaussians relative to the distance of their neighbours."""
-    mcmc_opacity_regularizer: float = 0.01
-    """MCMC: weight of the mean opacity in the loss, which frees Gaussians for relocation."""
-    mcmc_scale_regularizer: float = 0.01
-    """MCMC: weight of the mean scale (world units) in the loss."""
-    scale_by_extent: bool = False
-    """ADC: measure split and prune sizes, and the means' learning rate, in units of the cameras' extent (3DGS, the
-    paper) instead of the normalised scene (splatfacto)."""
-    pause_after_reset: int | None = None
-    """ADC: steps without refinement after an opacity reset; None: one a photo and a refinement's (splatfacto)."""
-    guards: bool = True
-    """Skip steps whose loss or gradients are not finite, keep sizes of Gaussians in [1e-8, 1e4] world units and the
-    learned matte in [6e-6, 0.999], revive a scene of which no Gaussian is alive, drop start points inside a camera.
-    (A checkpoint with values that are not finite is refused in any case.)"""
-    max_skipped_steps: int = 100
-    """Guards: so many skipped steps in a row end the training; looked at every 100 steps."""
-    rasterizer: RasterizerName = "auto"
-    """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""
+from ssa_nerfstudio.rasterization import rasterizer
 
 
 class SSASplatfactoModel(SplatfactoModel):
@@ -343,15 +282,7 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.training and self.step % self.metrics_every:
             return {}
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        shown = outputs.get("composite")
-        values: dict[str, Any] = {"gaussian_count": self.num_points}
-        with torch.no_grad():
-            values["psnr"] = _psnr(outputs["rgb"], target)
-            if shown is not None:
-                values["composite_psnr"] = _psnr(shown, target)
-            for group in range(len(self.artifacts)):
-                suffix = f"_{group}" if len(self.artifacts) > 1 else ""
-                values["overlay_covered" + suffix], values["overlay_matte" + suffix] = self.artifacts.covered(group)
+        values = {"gaussian_count": self.num_points, **figures_of_step(outputs, target, self.artifacts)}
         self.camera_optimizer.get_metrics_dict(values)
         return values
 
@@ -364,24 +295,4 @@ class SSASplatfactoModel(SplatfactoModel):
         artifact too.
         """
         target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
-        render = outputs["rgb"]
-        values = {
-            "psnr": metrics.psnr(render, target),
-            "ssim": metrics.ssim(render, target),
-            "flip": metrics.flip(render, target),
-            "mean_colour_deviation": metrics.mean_colour_deviation(render, target),
-        }
-        pictures = {"img": torch.cat([target, render], dim=1)}
-        if "composite" in outputs:
-            values["composite_psnr"] = metrics.psnr(outputs["composite"], target)
-            alpha = outputs["overlay_alpha"]
-            pictures["clean_and_composite"] = torch.cat([render, outputs["composite"]], dim=1)
-            pictures["overlay_and_matte"] = torch.cat(
-                [over_checkerboard(outputs["overlay_rgb"], alpha), alpha.expand_as(target)], dim=1
-            )
-        return values, pictures
-
-
-def _psnr(render: Tensor, target: Tensor) -> Tensor:
-    """PSNR in dB as a tensor on the device, unchecked: for the log of a training that may hold anything."""
-    return -10.0 * torch.log10((render - target).square().mean())
+        return figures_of_view(outputs, target), pictures_of_view(outputs, target)

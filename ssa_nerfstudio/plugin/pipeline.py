@@ -16,7 +16,8 @@ from ssa_nerfstudio.plugin.checkpoints import saved_pipeline
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.first_look import given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.inputs import check_device, check_settings, check_transforms, check_views
-from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 
 
 @dataclass

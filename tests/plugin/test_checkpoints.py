@@ -172,3 +172,14 @@ def test_an_error_while_writing_leaves_the_folder_as_it_was(tmp_path):
         fail()
     assert [path.read_text() for path in folder.iterdir()] == ["old"]
     assert [path.name for path in folder.parent.iterdir()] == ["nerfstudio_models"]
+
+
+def test_a_config_written_when_the_settings_were_in_the_models_module_loads():
+    import yaml
+
+    from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
+
+    written = yaml.dump(SSASplatfactoModelConfig(sparsity_weight=0.125))
+    assert "ssa_nerfstudio.plugin.settings.SSASplatfactoModelConfig" in written
+    former = written.replace("ssa_nerfstudio.plugin.settings.", "ssa_nerfstudio.plugin.model.")
+    assert yaml.load(former, Loader=yaml.Loader) == SSASplatfactoModelConfig(sparsity_weight=0.125)
