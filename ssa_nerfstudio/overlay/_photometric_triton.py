@@ -3,7 +3,7 @@
 """L1 + SSIM and its gradient on CUDA: four Triton kernels, each bound by memory. See `losses.photometric`.
 
 Images stay [H, W, C]: a shift by one pixel is a shift by C in memory, so that no channel needs to be told apart.
-Sums are written per block and added by torch, in an order that does not change from run to run.
+Shares of the loss are written per block and added by torch, in an order that does not change from run to run.
 """
 
 from __future__ import annotations
@@ -31,18 +31,19 @@ def value_and_gradient(
     spread = x.new_empty(3, height * line)
     gradient = torch.empty_like(x)
     blocks = [triton.cdiv(n, _BLOCK) for n in (height * line, rows * line, height * full_line)]
-    similarity, difference = x.new_empty(blocks[1]), x.new_empty(blocks[2])
+    shares = x.new_empty(blocks[1] + blocks[2])
     l1_scale = (1.0 - ssim_weight) / x.numel()
     ssim_scale = ssim_weight / (rows * line)
     _blur_rows[(blocks[0],)](x, y, weights, blurred, height * line, line, full_line, channels, size, _BLOCK)
-    _slopes[(blocks[1],)](blurred, weights, slopes, similarity, rows * line, height * line, line, size, _BLOCK)
+    _slopes[(blocks[1],)](
+        blurred, weights, slopes, shares, rows * line, height * line, line, -ssim_scale, size, _BLOCK
+    )  # fmt: skip
     _spread_columns[(blocks[0],)](slopes, weights, spread, height * line, rows * line, line, size, _BLOCK)
     _gradient[(blocks[2],)](
-        x, y, weights, spread, gradient, difference, height * full_line, height * line, line, full_line, channels,
-        l1_scale, -ssim_scale, size, _BLOCK,
+        x, y, weights, spread, gradient, shares[blocks[1] :], height * full_line, height * line, line, full_line,
+        channels, l1_scale, -ssim_scale, size, _BLOCK,
     )  # fmt: skip
-    value = difference.sum() * l1_scale - similarity.sum() * ssim_scale + ssim_weight
-    return value, gradient.to(prediction.dtype)
+    return shares.sum() + ssim_weight, gradient.to(prediction.dtype)
 
 
 _windows: dict[torch.device, Tensor] = {}
@@ -79,7 +80,7 @@ def _blur_rows(x_ptr, y_ptr, window, out, n, line, full_line, C, SIZE: tl.conste
 
 
 @triton.jit
-def _slopes(blurred, window, slopes, similarity, n, plane, line, SIZE: tl.constexpr, BLOCK: tl.constexpr):
+def _slopes(blurred, window, slopes, shares, n, plane, line, ssim_scale, SIZE: tl.constexpr, BLOCK: tl.constexpr):
     """Vertical window, then S and its derivatives by mean x, E[x^2 + y^2], E[xy]: slopes [3, H', W', C]."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
@@ -104,7 +105,7 @@ def _slopes(blurred, window, slopes, similarity, n, plane, line, SIZE: tl.conste
     tl.store(slopes + i, 2 * b * (n2 - n1) * inverse + 2 * a * s * (d1 - d2) * inverse, mask=inside)
     tl.store(slopes + n + i, -s * d1 * inverse, mask=inside)
     tl.store(slopes + 2 * n + i, 2 * n1 * inverse, mask=inside)
-    tl.store(similarity + tl.program_id(0), tl.sum(tl.where(inside, s, 0.0)))
+    tl.store(shares + tl.program_id(0), ssim_scale * tl.sum(tl.where(inside, s, 0.0)))
 
 
 @triton.jit
@@ -129,7 +130,7 @@ def _spread_columns(slopes, window, spread, n, plane, line, SIZE: tl.constexpr, 
 
 @triton.jit
 def _gradient(
-    x_ptr, y_ptr, window, spread, gradient, difference, n, plane, line, full_line, C, l1_scale, ssim_scale,
+    x_ptr, y_ptr, window, spread, gradient, shares, n, plane, line, full_line, C, l1_scale, ssim_scale,
     SIZE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     """The horizontal window transposed, chained to the pixels, and the L1 term: gradient [H, W, C]."""
@@ -152,4 +153,4 @@ def _gradient(
     y = tl.load(y_ptr + i, mask=inside, other=0.0)
     sign = tl.where(x > y, 1.0, tl.where(x < y, -1.0, 0.0))
     tl.store(gradient + i, l1_scale * sign + ssim_scale * (a + 2 * x * q + y * p), mask=inside)
-    tl.store(difference + tl.program_id(0), tl.sum(tl.where(inside, tl.abs(x - y), 0.0)))
+    tl.store(shares + tl.program_id(0), l1_scale * tl.sum(tl.where(inside, tl.abs(x - y), 0.0)))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -281,3 +284,34 @@ def test_adam_moves_the_matte_at_real_resolutions_only_with_an_eps_below_the_gra
             overlay.alpha_logits.grad = 0.05 * alpha * (1 - alpha) / (840 * 1297)
         optimizer.step()
     assert lowest < overlay.matte().item() < highest
+
+
+INTERPRETED = """
+import torch
+from ssa_nerfstudio.overlay._photometric_triton import value_and_gradient
+from ssa_nerfstudio.overlay.losses import gaussian_window, photometric_reference
+
+torch.manual_seed(0)
+for height, width in ((11, 11), (23, 40)):
+    x, y = torch.rand(2, height, width, 3)
+    leaf = x.clone().requires_grad_()
+    expected = photometric_reference(leaf, y, 0.2)
+    expected.backward()
+    value, gradient = value_and_gradient(x, y, 0.2, gaussian_window())
+    torch.testing.assert_close(value, expected.detach(), rtol=1e-6, atol=0)
+    torch.testing.assert_close(gradient, leaf.grad, rtol=1e-4, atol=1e-8)
+print("equal")
+"""
+
+
+def test_tritons_kernels_are_the_formula_in_its_interpreter() -> None:
+    """The kernels of a CUDA machine, on any."""
+    pytest.importorskip("triton")
+    process = subprocess.run(
+        [sys.executable, "-c", INTERPRETED],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert process.stdout.strip() == "equal", process.stderr
