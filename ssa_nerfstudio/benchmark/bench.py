@@ -95,12 +95,12 @@ def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, 
 
         def ended(run: Run, result: Result | None) -> None:
             table.ended(run, result)
-            if result is None or result.status == "failed":
-                return
-            expected.add(result)
+            trained = result if result is not None and result.status != "failed" else None
+            if trained is not None:
+                expected.add(trained)
             for other in missing:
                 if other.training == run.training and other.id != run.id:
-                    table.ended(other, adopt(result, other, place.folder))
+                    table.ended(other, result if trained is None else adopt(trained, other, place.folder))
 
         for run in missing:
             if run.training in known:

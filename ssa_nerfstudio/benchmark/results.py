@@ -52,7 +52,7 @@ class Result:
     revision: str = ""
     """git revision of the code; + where files differed from it."""
     command: str = ""
-    """What repeats this run."""
+    """What repeats this run, or the one that it is the same as."""
     same_as: str = ""
     """Id of the run that was trained, where this one is the same training under another method's name."""
     ended: str = ""

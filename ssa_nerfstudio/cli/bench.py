@@ -40,7 +40,7 @@ class Command:
     merge: tuple[Path, ...] = ()
     """Take over the results of these folders first."""
     keep_models: bool = False
-    """Keep config.yml and checkpoint of every run in models/, for ns-viewer and ns-export."""
+    """Keep config.yml and checkpoint of every training in models/, for ns-viewer and ns-export."""
     list: bool = False
     """Print the ids of the runs, and which are done, and stop."""
     threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

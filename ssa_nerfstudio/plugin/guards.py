@@ -62,13 +62,13 @@ class StepGuard:
 
         Args:
             losses: the terms of the loss, detached scalars.
-            optimizers: by name.
+            optimizers: by name. Gradients are multiplied and divided again in place: no two may share memory.
         """
         if self._judged == 0:
             self._skips = losses[0].new_zeros(READ_EVERY, dtype=torch.float32)
             self._skip = self._skips.unbind()
             self._there_and_back = [losses[0].new_full((), 2.0**k, dtype=torch.float32) for k in (64, -64)]
-        self._optimizers, self._losses = optimizers, losses
+        self._optimizers, self._losses = optimizers, [loss.float() for loss in losses]
         # Not from a list of old: densification puts new parameters into the optimisers.
         gradients = [p.grad for o in optimizers.values() for group in o.param_groups for p in group["params"]]
         self.skipped = self._skip[self._judged]
@@ -111,14 +111,15 @@ class StepGuard:
         Raises:
             TrainingFailed: where `limit` steps in a row, up to any of them, were skipped.
         """
-        skips = self._skips[: self._judged].tolist() if self._judged else []
+        if not self._judged:
+            return 0
+        skips = self._skips[: self._judged].tolist()
         self._judged = 0
         skipped = int(sum(skips))
         if not skipped:
             self._row = 0
             return 0
-        # The gradients of the last step are still there; of earlier ones nothing but that they were skipped.
-        culprits = self._culprits() if skips[-1] else "the loss or a gradient was"
+        culprits = self._culprits(bool(skips[-1]))
         for at, skip in enumerate(skips, start=step + 1 - len(skips)):
             if not skip:
                 self._row = 0
@@ -135,8 +136,13 @@ class StepGuard:
         warn(f"{skipped} of the {len(skips)} steps up to {step} were skipped: {culprits} not finite")
         return skipped
 
-    def _culprits(self) -> str:
-        """What is not finite: "the loss", "the gradient of scales", and the parameters that are so themselves."""
+    def _culprits(self, still_there: bool) -> str:
+        """What is not finite: "the loss", "the gradient of scales", and the parameters that are so themselves.
+
+        Args:
+            still_there: the last step was skipped, and its loss and gradients can be looked at; those of earlier ones
+                are gone, as are gradients that optimisers were kept from, or of parameters that a refinement replaced.
+        """
         parameters = list(_parameters(self._optimizers))
         values = [name for name, p in parameters if not torch.isfinite(p).all()]
         if values:
@@ -144,10 +150,12 @@ class StepGuard:
         present = [name for name, p in parameters if p.grad is not None]
         broken = [name for name, p in parameters if p.grad is not None and not torch.isfinite(p.grad).all()]
         parts = [THE_LOSS] * (not all(torch.isfinite(loss) for loss in self._losses))
-        if broken == present:
+        if len(broken) > 1 and broken == present:
             parts.append("every gradient")
         elif broken:
             parts.append(f"the gradient of {', '.join(broken)}")
+        if not (parts and still_there):
+            return "the loss or a gradient was"
         return f"{' and '.join(parts)} {'was' if len(parts) == 1 else 'were'}"
 
 

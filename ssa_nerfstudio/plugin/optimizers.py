@@ -36,8 +36,6 @@ class JointOptimizers(Optimizers):
         self.guard, self._losses = guard, losses
         self._quick: set[str] = set()
         """Groups of which nothing is asked but to step."""
-        self._counted: list[FusedAdam] = []
-        """Optimisers whose last step was counted whether it was skipped or not."""
         for name, optimizer in self.optimizers.items():
             if guard is not None:
                 guard.watch(optimizer)
@@ -59,23 +57,11 @@ class JointOptimizers(Optimizers):
         if self.guard is not None:
             self.guard.judge(self._losses(), optimizers)
         others = [name for name in param_groups if grad_scaler.is_enabled() or name not in self._quick]
-        self._counted = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
-        # Skipped ones too, until the host's next look: to leave them out costs a kernel at every step.
-        count_steps([counter for optimizer in self._counted for counter in optimizer.counters()], 1)
+        quick = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
         with torch.no_grad():
-            for optimizer in self._counted:
+            counters = [counter for optimizer in quick for counter in optimizer.counters()]
+            count_steps(counters, 1 if self.guard is None or self.guard.skipped is None else 1 - self.guard.skipped)
+            for optimizer in quick:
                 optimizer.update(optimizer.refused)
         if others:
             super().optimizer_scaler_step_some(grad_scaler, others)
-
-    def look(self, step: int) -> None:
-        """Let the host see what the guard noted, and take skipped steps out of the counts.
-
-        Raises:
-            TrainingFailed: the guard gives up.
-        """
-        if self.guard is None:
-            return
-        skipped = self.guard.look(step)
-        if skipped:
-            count_steps([counter for optimizer in self._counted for counter in optimizer.counters()], -skipped)

@@ -125,7 +125,8 @@ class SSATrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint, whole and finite or not at all; older ones go only when it is there."""
-        self.optimizers.look(step)
+        if self.optimizers.guard is not None:
+            self.optimizers.guard.look(step)
         states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
         broken = first_not_finite({**self.pipeline.state_dict(), **states})
         if broken is not None:
@@ -154,10 +155,11 @@ class SSATrainer(Trainer):
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
         """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""
         loss, losses, metrics = super().train_iteration(step)
-        if self.optimizers.guard is not None:
-            self.pipeline.model.info["skipped"] = self.optimizers.guard.skipped
+        guard = self.optimizers.guard
+        if guard is not None:
+            self.pipeline.model.info["skipped"] = guard.skipped
             if (step + 1) % READ_EVERY == 0:
-                self.optimizers.look(step)
+                guard.look(step)
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:

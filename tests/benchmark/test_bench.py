@@ -121,6 +121,14 @@ def test_one_training_answers_for_every_name_it_goes_by(tmp_path, capsys):
     assert not (known / "scenes").exists()
 
 
+def test_what_a_training_leaves_undone_is_left_under_each_of_its_names(tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text("scenes: [{data: demo}]\nparts: [{methods: [paper, l1-0.05], effects: [dashboard], steps: 5}]")
+    done = ssa("bench", path, "--output", tmp_path / "out", "--time-limit", "0.001")
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 runs are left" in done.stdout
+
+
 def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monkeypatch, capsys):
     path = tmp_path / "rain.yaml"
     path.write_text("scenes: [{data: demo}]\nparts: [{methods: [3dgs], effects: [rain]}]")

@@ -108,5 +108,16 @@ def test_an_overlay_is_in_front_of_a_render_as_its_layers_say(resolution, reduct
             parameter.copy_(torch.randn(parameter.shape, generator=generator))
     clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64)
     behind = (clean[..., :1], torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)) if over_splats else None
-    shown = overlay.in_front_of(clean, reduction, behind)
-    torch.testing.assert_close(shown, composite(clean, *overlay.layers(reduction)), rtol=0, atol=1e-15)
+    found = []
+    for ours in (True, False):
+        overlay.zero_grad()
+        if ours:
+            shown = overlay.in_front_of(clean, reduction, behind)
+        elif behind is None:
+            shown = composite(clean, *overlay.layers(reduction))
+        else:
+            shown = composite_over_splats(clean, *behind, *overlay.layers(reduction))
+        (shown**2).sum().backward()
+        found.append((shown.detach(), overlay.color_logits.grad, overlay.alpha_logits.grad))
+    for mine, expected in zip(*found, strict=True):
+        torch.testing.assert_close(mine, expected, rtol=1e-12, atol=1e-14)

@@ -96,16 +96,15 @@ def test_a_step_that_is_not_finite_leaves_everything_as_it_was(tiny_scene, tmp_p
     before, after = states[1], states[2]
     assert before.keys() == after.keys()
     assert changed(before, after) == set()
-    assert {"_model.gauss_params.means", "means.0.exp_avg", "grad2d", "count"} <= changed(after, states[3])
+    assert {"_model.gauss_params.means", "means.0.exp_avg", "means.0.step", "grad2d", "count"} <= changed(
+        after, states[3]
+    )
     assert first_not_finite(states[3]) is None
-    # Adam's numbers of steps are put right when the host looks, here for the checkpoint at the end.
-    assert {int(v) for name, v in state(trainer).items() if name.endswith(".step")} == {3}
 
 
 def changed(before: dict[str, Tensor], after: dict[str, Tensor]) -> set[str]:
-    """What differs, but for Adam's numbers of steps."""
-    names = {name for name in before if not name.endswith(".step")}
-    return {name for name in names if not torch.equal(before[name], after[name])}
+    """What differs."""
+    return {name for name in before if not torch.equal(before[name], after[name])}
 
 
 class Operations(TorchDispatchMode):
@@ -142,7 +141,7 @@ def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_pa
     assert more["item"] == 0
     launched = more.total() - more["view"] - more["detach"] - more["alias"]
     fewer = counts[False] - counts[True]
-    assert launched - fewer.total() <= (4 if "mcmc" in method else 2)
+    assert launched - fewer.total() <= (5 if "mcmc" in method else 3)
 
 
 @OVERLAYS
@@ -198,7 +197,7 @@ def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_or
     torch.testing.assert_close(parameter.detach()[:2], torch.full((2,), -0.2))
     assert torch.isinf(plain.state[frozen]["exp_avg_sq"][0])
     guard.look(2)
-    assert "every gradient was not finite" in capsys.readouterr().err
+    assert "the gradient of p was not finite" in capsys.readouterr().err
 
 
 def test_what_has_a_finite_square_is_not_skipped():
