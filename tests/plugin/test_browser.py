@@ -48,11 +48,13 @@ def scene(page) -> np.ndarray:
 
 
 def eventually(page, holds: Callable[[np.ndarray], bool], what: str) -> np.ndarray:
-    """The first picture of which a condition holds."""
+    """The first picture of which a condition holds, and that stays: viser draws a coarse one first."""
+    before = None
     for _ in range(120):
         seen = scene(page)
-        if holds(seen):
+        if holds(seen) and before is not None and np.abs(seen - before).mean() < 1e-3:
             return seen
+        before = seen
         page.wait_for_timeout(500)
     raise AssertionError(f"after a minute: {what}")
 
