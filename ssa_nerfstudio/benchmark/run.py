@@ -137,6 +137,7 @@ def train_and_evaluate(
         config.pipeline._target, config.pipeline.datamanager._target = _TimedPipeline, _TimedDatamanager
         trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
+        writer.EVENT_WRITERS.clear()  # nobody reads them, and the viewer that they stand in for has none
         pipeline = cast(_TimedPipeline, trainer.pipeline)
         pipeline.read_photos(test_scale)
         clock = _Clock(pipeline, config.max_num_iterations, marks, on_step)

@@ -19,6 +19,7 @@ import tyro
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils import writer
 
 from ssa_nerfstudio.benchmark.run import METHODS
 
@@ -60,6 +61,7 @@ class Command:
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.config.viewer.quit_on_train_completion = True
+        writer.EVENT_WRITERS.clear()  # tensorboard's, which splatfacto's default, the viewer, does without
         times: dict[int, float] = {}
 
         def note(step: int) -> None:

@@ -15,6 +15,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.errors import give_up, refuse, warn
 from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
+from ssa_nerfstudio.plugin.event_writers import spare_event_writers
 from ssa_nerfstudio.plugin.guards import READ_EVERY, StepGuard, first_not_finite
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.optimizers import JointOptimizers
@@ -79,6 +80,7 @@ class SSATrainer(Trainer):
         """
         self.config.pipeline.artifacts_of = self._resumed_checkpoint()
         super().setup(test_mode)
+        spare_event_writers(self.config.logging.steps_per_log)
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._tell_artifact))
 
     def _tell_artifact(self, step: int) -> None:

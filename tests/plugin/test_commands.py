@@ -78,6 +78,10 @@ def test_tensorboard_gets_the_artifact_as_pictures_and_figures(config):
     log = EventAccumulator(str(config.parent)).Reload()
     assert {f"Train Metrics Dict/overlay_{name}" for name in ("covered", "matte")} <= set(log.Tags()["scalars"])
     assert "Train Loss Dict/sparsity" in log.Tags()["scalars"]
+    # At the steps at which losses are logged, and at no other.
+    logged = [event.step for event in log.Scalars("Train Loss")]
+    for name in ("Train Iter (time)", "learning_rate/means"):
+        assert {event.step for event in log.Scalars(name)} == set(logged)
     for name in ("clean_and_composite", "overlay_and_matte"):
         newest = log.Images(f"Eval Images/{name}")[-1]
         assert (newest.step, newest.width, newest.height) == (200, 128, 48)
