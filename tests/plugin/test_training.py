@@ -37,9 +37,10 @@ def trained(tiny_scene, tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained")
     given = dashboard_layers(folder / "layers.npz")
     return {
-        "off": run(tiny_scene, folder, 80, overlay="off"),
-        "on": run(tiny_scene, folder, 80),
-        "given": run(tiny_scene, folder, 80, overlay="given", overlay_given=given),
+        # A folder each: nerfstudio names runs by the second, and two of these fit into one.
+        "off": run(tiny_scene, folder / "off", 80, overlay="off"),
+        "on": run(tiny_scene, folder / "on", 80),
+        "given": run(tiny_scene, folder / "given", 80, overlay="given", overlay_given=given),
     }
 
 
