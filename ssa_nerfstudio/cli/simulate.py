@@ -19,9 +19,8 @@ class Command:
     output: Path
     """Dataset to write; must not exist."""
     effects: tuple[str, ...] | None = None
-    """Effects, from the scene outwards: watermark, ui, dashboard, rain, mud, finger, occlusion, vignette, dust, names
-    of their shipped variants, or .yaml files. `--effects` with nothing behind it copies the dataset and adds the
-    split."""
+    """From the scene outwards: watermark, ui, dashboard, rain, mud, finger, occlusion, vignette, dust, their variants
+    by name, or .yaml files. `--effects` with nothing behind it copies the dataset and adds the split."""
     scene: str | None = None
     """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats its effects."""
     seed: int | None = None
