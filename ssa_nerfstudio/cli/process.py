@@ -29,8 +29,8 @@ class Command:
     invert_mask: bool = False
     """White marks the artifact in --mask instead."""
     detect: bool = False
-    """Detect where an opaque artifact is (see ssa detect) and mask it, where --mask is not given. What light shines
-    through is never masked: the scene behind it would be lost, too."""
+    """Detect where an opaque artifact is (see ssa detect) and mask it, where --mask is not given. What light
+    shines through is never masked: the scene behind it would be lost, too."""
     frames: int = 200
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighbourhood."""
     min_registered: float = 0.5
@@ -38,8 +38,8 @@ class Command:
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """All pairs of photos, or neighbours in time and a net over all; auto: all pairs up to 150 photos."""
     flatten: bool = True
-    """Look for features in copies of the photos of --train that lack what is the same in all of them, where they share
-    anything; the dataset's photos stay as they are."""
+    """Look for features in copies of the photos of --train that lack what is the same in all of them, where they
+    share anything; the dataset's photos stay as they are."""
     filter_stationary: bool = True
     """Drop matches that lie at the same place of both frames: what they match is in front of the lens."""
     max_image_size: int = 1600
