@@ -78,11 +78,10 @@ def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, 
     done = {result.run.id for result in results if result.status != "failed"}
     missing = [run for run in runs if run.id not in done]
     known = {result.run.training: result for result in results if result.status != "failed"}
-    trainings: dict[str, Run] = {}
+    names: dict[str, list[Run]] = {}  # of each training, in the order of their importance
     for run in missing:
-        if run.training not in known:
-            trainings.setdefault(run.training, run)
-    todo = list(trainings.values())
+        names.setdefault(run.training, []).append(run)
+    todo = [same[0] for training, same in names.items() if training not in known]
     prepare(todo, place.scenes, place.artifacts, options.threads)
 
     def command(run: Run) -> str:
@@ -98,21 +97,19 @@ def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, 
             trained = result if result is not None and result.status != "failed" else None
             if trained is not None:
                 expected.add(trained)
-            for other in missing:
-                if other.training == run.training and other.id != run.id:
-                    table.ended(other, result if trained is None else adopt(trained, other, place.folder))
+            for other in names[run.training][1:]:
+                table.ended(other, result if trained is None else adopt(trained, other, place.folder))
 
-        for run in missing:
-            if run.training in known:
-                table.ended(run, adopt(known[run.training], run, place.folder))
+        for training, same in names.items():
+            for run in same if training in known else ():
+                table.ended(run, adopt(known[training], run, place.folder))
         if options.scheduler is not None:
             cluster = Cluster(place, options.scheduler, options.runs_per_device, command, options.keep_models)
             left = cluster.work(todo, deadline, table.watch_cluster, ended)
         else:
             local = Local(place, found, options.runs_per_device, command, options.keep_models)
             left = local.work(todo, expected.seconds, deadline, table.watch, ended)
-    undone = {run.training for run in left}
-    return [run for run in missing if run.training in undone]
+    return [same for run in left for same in names[run.training]]
 
 
 class Expectation:

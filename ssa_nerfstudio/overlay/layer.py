@@ -167,9 +167,8 @@ class ScreenSpaceOverlay(nn.Module):
         """
         if self.resolution == reduction == 1 and not self.adds_light:
             return paint(clean, self.color_logits, self.alpha_logits, behind)
-        if behind is None:
-            return composite(clean, *self.layers(reduction))
-        return composite_over_splats(clean, *behind, *self.layers(reduction))
+        layers = self.layers(reduction)
+        return composite(clean, *layers) if behind is None else composite_over_splats(clean, *behind, *layers)
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """Transmittance [H // reduction, W // reduction, 1] and added light [..., 3], averaged premultiplied.

@@ -7,6 +7,14 @@ from typing import Any
 from nerfstudio.utils import writer
 from nerfstudio.utils.writer import EventName
 
+TIMES = frozenset(
+    name.value
+    for name in (EventName.ITER_TRAIN_TIME, EventName.ETA, EventName.TRAIN_RAYS_PER_SEC, EventName.VIS_RAYS_PER_SEC)
+)
+"""Names of the times and rates that are written at every step."""
+LEARNING_RATES = "learning_rate/"
+"""How the names of learning rates begin."""
+
 
 class SparingWriter:
     """An event writer of nerfstudio's that gets every number at those steps only at which losses are logged.
@@ -21,7 +29,7 @@ class SparingWriter:
 
     def write_scalar(self, name: str, scalar: Any, step: int) -> None:
         """Write a number, unless it is one of those and of a step between."""
-        if step % self._every == 0 or not _written_at_every_step(name):
+        if step % self._every == 0 or not (name in TIMES or name.startswith(LEARNING_RATES)):
             self._inner.write_scalar(name, scalar, step)
 
     def __getattr__(self, name: str) -> Any:
@@ -34,8 +42,3 @@ def spare_event_writers(every: int) -> None:
         each if isinstance(each, writer.LocalWriter) else SparingWriter(each, max(1, every))
         for each in writer.EVENT_WRITERS
     ]
-
-
-def _written_at_every_step(name: str) -> bool:
-    times = (EventName.ITER_TRAIN_TIME, EventName.ETA, EventName.TRAIN_RAYS_PER_SEC, EventName.VIS_RAYS_PER_SEC)
-    return name.startswith("learning_rate/") or any(name == time.value for time in times)

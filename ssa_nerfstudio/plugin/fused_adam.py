@@ -50,7 +50,7 @@ class FusedAdam(torch.optim.Adam):
         refused = self.refused
         if overflow is not None:
             refused = overflow if refused is None else torch.maximum(overflow, refused)
-        count_steps(self.counters(), 1 if refused is None else 1 - refused)
+        count_steps(self.counters(), None if refused is None else 1 - refused)
         self.update(refused, scale)
 
     def update(self, refused: Tensor | None, scale: Tensor | None = None) -> None:
@@ -92,9 +92,11 @@ class FusedAdam(torch.optim.Adam):
         return state
 
 
-def count_steps(counters: list[Tensor], more: int | Tensor) -> None:
-    """Add so many to numbers of steps on the device, in one kernel; of a tensor [] the host does not ask which."""
+def count_steps(counters: list[Tensor], taken: Tensor | None) -> None:
+    """Add 1 to numbers of steps, or what is `taken` [], on the device; in one kernel.
+
+    A list of it, because torch would read a tensor without dimensions from the device to use it as a number.
+    """
     if counters:
-        # A list, because torch would read a tensor without dimensions from the device to use it as a number.
-        added = more if isinstance(more, int) else [more.reshape(())] * len(counters)
-        torch._foreach_add_(counters, added)  # pyright: ignore[reportPrivateImportUsage]
+        more = 1 if taken is None else [taken.reshape(())] * len(counters)
+        torch._foreach_add_(counters, more)  # pyright: ignore[reportPrivateImportUsage]

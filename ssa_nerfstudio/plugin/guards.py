@@ -57,12 +57,15 @@ class StepGuard:
         """Steps since the last look."""
         self._row, self._row_began = 0, 0
 
-    def judge(self, losses: Sequence[Tensor], optimizers: Mapping[str, torch.optim.Optimizer]) -> None:
+    def judge(self, losses: Sequence[Tensor], optimizers: Mapping[str, torch.optim.Optimizer]) -> Tensor:
         """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device.
 
         Args:
             losses: the terms of the loss, detached scalars.
             optimizers: by name. Gradients are multiplied and divided again in place: no two may share memory.
+
+        Returns:
+            What `skipped` is from now on.
         """
         if self._judged == 0:
             self._skips = losses[0].new_zeros(READ_EVERY, dtype=torch.float32)
@@ -83,6 +86,7 @@ class StepGuard:
         for optimizer in optimizers.values():
             if isinstance(optimizer, FusedAdam):
                 optimizer.refused = self.skipped
+        return self.skipped
 
     def watch(self, optimizer: torch.optim.Optimizer) -> None:
         """Let an optimiser take no step that was judged to be skipped."""

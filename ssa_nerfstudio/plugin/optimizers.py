@@ -54,14 +54,13 @@ class JointOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Judge the step, and step the groups."""
         optimizers = {name: self.optimizers[name] for name in param_groups}
-        if self.guard is not None:
-            self.guard.judge(self._losses(), optimizers)
+        refused = None if self.guard is None else self.guard.judge(self._losses(), optimizers)
         others = [name for name in param_groups if grad_scaler.is_enabled() or name not in self._quick]
         quick = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
         with torch.no_grad():
             counters = [counter for optimizer in quick for counter in optimizer.counters()]
-            count_steps(counters, 1 if self.guard is None or self.guard.skipped is None else 1 - self.guard.skipped)
+            count_steps(counters, None if refused is None else 1 - refused)
             for optimizer in quick:
-                optimizer.update(optimizer.refused)
+                optimizer.update(refused)
         if others:
             super().optimizer_scaler_step_some(grad_scaler, others)

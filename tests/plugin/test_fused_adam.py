@@ -53,7 +53,7 @@ def test_steps_that_are_counted_together_are_not_counted_again() -> None:
     optimizers = [FusedAdam([parameter], lr=0.1) for parameter in parameters]
     for parameter in parameters[:2]:
         parameter.grad = torch.ones(2)
-    count_steps([counter for optimizer in optimizers for counter in optimizer.counters()], 1)
+    count_steps([counter for optimizer in optimizers for counter in optimizer.counters()], torch.tensor(1.0))
     for optimizer in optimizers[:2]:
         with torch.no_grad():
             optimizer.update(None)
