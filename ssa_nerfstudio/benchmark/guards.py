@@ -1,8 +1,8 @@
 """What the guards cost: `python -m ssa_nerfstudio.benchmark.guards --data DIR`
 
-Blocks of steps of one training take turns with and without, so that both draw the same Gaussians and a machine that
-drifts drifts for both; the device is waited for between blocks only. The scene grows first and keeps its Gaussians
-then. Prints the ratio of the times with its interval.
+One training takes every step number twice, with guards and without, in short blocks that take turns: both draw the same
+Gaussians, and a machine that drifts drifts for both. The scene grows first and keeps its Gaussians then. Nothing waits
+for the device between blocks; its own clock tells the times. Prints their ratio with its interval.
 """
 
 from __future__ import annotations
@@ -37,16 +37,16 @@ class Command:
     grow: int = 2_000
     """Steps of ordinary training before the first block."""
     pairs: int = 100
-    """Pairs of blocks, one with guards and one without; the first two warm up."""
-    block: int = READ_EVERY
-    """Steps of a block: a multiple of those between two looks of the host, so that every block has as many."""
+    """So many times as many steps as lie between two looks of the host; the first two warm up."""
+    block: int = 10
+    """Steps before the other takes its turn."""
     scale_factor: float = 1.0
     """Photos are resized by this."""
 
     def run(self) -> None:
         """Train in turns and print one line."""
-        if self.block % READ_EVERY or self.pairs < 3:
-            raise refuse(f"--block must be a multiple of {READ_EVERY} and --pairs at least 3")
+        if READ_EVERY % self.block or self.pairs < 3:
+            raise refuse(f"--block must divide {READ_EVERY} and --pairs be at least 3")
         with TemporaryDirectory() as folder:
             training = self._training(Path(folder))
             for _ in range(self.grow):
@@ -55,22 +55,32 @@ class Command:
         percent = 100 * (times[:, 1] / times[:, 0] - 1)
         draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
         low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
-        without = 1e3 * np.median(times[:, 0]) / self.block
+        without = 1e3 * np.median(times[:, 0]) / READ_EVERY
         gaussians = training.trainer.pipeline.model.num_points
         print(
             f"{self.method}, overlay {self.overlay}, {gaussians} Gaussians, {versions()['device']}: {without:.3f} ms a "
             f"step without guards; with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
         )
 
-    def _pair(self, training: Training, pair: int) -> tuple[float, float]:
-        """Seconds of a block without and of one with guards; the one that is first is so every other time."""
-        first = bool(pair % 2)
-        times = {first: self._time(training, first), (not first): self._time(training, not first)}
-        return times[False], times[True]
+    def _pair(self, training: Training, pair: int) -> list[float]:
+        """Seconds of `READ_EVERY` steps without guards, and of the same with."""
+        laps: dict[bool, list[Lap]] = {False: [], True: []}
+        for block in range(READ_EVERY // self.block):
+            begin = training.steps
+            first = bool((pair + block) % 2)
+            for guarded in (first, not first):
+                training.steps = begin
+                training.switch(guarded)
+                lap = Lap()
+                for _ in range(self.block):
+                    training.step()
+                lap.end()
+                laps[guarded].append(lap)
+        return [sum(lap.seconds() for lap in laps[guarded]) for guarded in (False, True)]
 
     def _training(self, output: Path) -> Training:
         model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": self.grow, "mcmc_stop_at": self.grow}
-        steps = self.grow + 2 * self.pairs * self.block
+        steps = self.grow + self.pairs * READ_EVERY
         config = configure(self.method, self.data, output, steps, model, self.scale_factor)
         config.scale_schedules = False
         torch.manual_seed(0)
@@ -80,14 +90,29 @@ class Command:
         trainer.pipeline.train()
         return Training(trainer)
 
-    def _time(self, training: Training, guarded: bool) -> float:
-        training.switch(guarded)
-        _wait()
-        start = time.perf_counter()
-        for _ in range(self.block):
-            training.step()
-        _wait()
-        return time.perf_counter() - start
+
+class Lap:
+    """A stretch of work between now and `end`, by the device's clock where there is one, else by the host's."""
+
+    def __init__(self) -> None:
+        self._events = [torch.cuda.Event(enable_timing=True) for _ in range(2)] if torch.cuda.is_available() else []
+        self._start = self._mark(0)
+
+    def _mark(self, which: int) -> float:
+        if self._events:
+            self._events[which].record()
+        return time.perf_counter()
+
+    def end(self) -> None:
+        """Until here."""
+        self._seconds = self._mark(1) - self._start
+
+    def seconds(self) -> float:
+        """How long it took; waits for the device."""
+        if not self._events:
+            return self._seconds
+        self._events[1].synchronize()
+        return self._events[0].elapsed_time(self._events[1]) / 1e3
 
 
 class Training:
@@ -116,11 +141,6 @@ class Training:
             callback.run_callback_at_location(self.steps, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
         self.steps += 1
         return losses
-
-
-def _wait() -> None:
-    if torch.cuda.is_available():
-        torch.cuda.synchronize()
 
 
 if __name__ == "__main__":
