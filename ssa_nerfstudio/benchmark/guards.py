@@ -121,11 +121,13 @@ class Training:
     def __init__(self, trainer: SSATrainer) -> None:
         self.trainer, self.steps = trainer, 0
         self._guard = trainer.optimizers.guard
+        self._scalers = {True: trainer.grad_scaler, False: torch.amp.GradScaler(enabled=False)}
 
     def switch(self, guarded: bool) -> None:
         """Do as from the start with `guards` in the configuration."""
         trainer, model = self.trainer, self.trainer.pipeline.model
         trainer.optimizers.guard = self._guard if guarded else None
+        trainer.grad_scaler = self._scalers[guarded]
         model.config.guards = model.strategy.guarded = guarded
         model.info = {}
         for optimizer in trainer.optimizers.optimizers.values():

@@ -61,11 +61,12 @@ class AdaptiveDensityControl(DefaultStrategy):
             # The float 1 of a skipped step is 0x3f800000 as an integer: no radius is larger, nothing counts as visible.
             least = info["skipped"].view(torch.int32)
         width, height = info["width"], info["height"]
+        half = 0.5 * info["n_cameras"] * width / info.get("magnification", 1.0)
         for gradient, radii in zip(gradients, info["radii"], strict=True):  # a camera's [N, 2], [N]
             visible = radii > least
             # With respect to coordinates that run over [-1, 1] across the image.
             norms = torch.hypot(gradient[:, 0], gradient[:, 1] * (height / width))
-            state["grad2d"].add_(torch.where(visible, norms, 0.0), alpha=0.5 * info["n_cameras"] * width)
+            state["grad2d"].add_(torch.where(visible, norms, 0.0), alpha=half)
             state["count"] += visible
             if self.refine_scale2d_stop_iter > 0:
                 sizes = torch.where(visible, radii, 0) / float(max(width, height))

@@ -7,7 +7,7 @@ configuration takes all of it away.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -36,57 +36,71 @@ LONELY_SIZE = 0.01
 
 class StepGuard:
     """Decides on the device whether a step may be taken: where the loss and every gradient are finite, and so are the
-    squares of all of them.
+    squares of all gradients.
 
     The squares, because one that overflows turns Adam's second moment into infinity, after which that element never
     moves again, or is not finite at the next step.
+
+    All of this is in the number that the backward pass begins with, usually 1 (see `seed`): it makes gradients not
+    finite where the loss is not, and so large that those without a finite square overflow. What is left is one search
+    through the gradients, which makes them what they were. Powers of two, so that nothing is rounded.
     """
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, exponent: int = 64) -> None:
         """Make a guard.
 
         Args:
             limit: so many skipped steps in a row end the training, at the host's next look.
+            exponent: gradients come out of the backward pass 2^exponent times as large. 64 is half of what float32 has,
+                so that squares are looked after; 0 for gradients of half precision or from elsewhere.
         """
         self.limit = limit
+        self.magnification = 2.0**exponent
+        """How much too large gradients are between the backward pass and the judgement."""
         self.skipped: Tensor | None = None
         """1 where the current step is skipped, else 0: one float tensor on the device; None before the first step."""
         self._optimizers: Mapping[str, torch.optim.Optimizer] = {}
-        self._losses: Sequence[Tensor] = ()
+        self._loss: Tensor | None = None
+        self._seed: Tensor | None = None
         self._judged = 0
         """Steps since the last look."""
         self._row, self._row_began = 0, 0
 
-    def judge(self, losses: Sequence[Tensor], optimizers: Mapping[str, torch.optim.Optimizer]) -> Tensor:
+    def seed(self, loss: Tensor) -> Tensor:
+        """What the backward pass of a loss [] has to begin with; NaN where it is not finite."""
+        if self._seed is None:
+            self._seed = torch.full_like(loss, self.magnification, requires_grad=False)
+        self._loss = loss.detach()
+        return torch.add(self._seed, self._loss, alpha=0)
+
+    def judge(self, optimizers: Mapping[str, torch.optim.Optimizer]) -> Tensor:
         """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device.
 
         Args:
-            losses: the terms of the loss, detached scalars.
-            optimizers: by name. Gradients are multiplied and divided again in place: no two may share memory.
+            optimizers: by name. Their gradients become `magnification` times smaller, in place: no two may share
+                memory.
 
         Returns:
             What `skipped` is from now on.
         """
-        if self._judged == 0:
-            self._skips = losses[0].new_zeros(READ_EVERY, dtype=torch.float32)
-            self._skip = self._skips.unbind()
-            self._there_and_back = [losses[0].new_full((), 2.0**k, dtype=torch.float32) for k in (64, -64)]
-        self._optimizers, self._losses = optimizers, [loss.float() for loss in losses]
         # Not from a list of old: densification puts new parameters into the optimisers.
-        gradients = [p.grad for o in optimizers.values() for group in o.param_groups for p in group["params"]]
-        self.skipped = self._skip[self._judged]
+        parameters = [p for o in optimizers.values() for group in o.param_groups for p in group["params"]]
+        if self._judged == 0:
+            self._skips = parameters[0].new_zeros(READ_EVERY, dtype=torch.float32)
+            self._skip = self._skips.unbind()
+            self._smaller = torch.full_like(self._skip[0], 1 / self.magnification)
+        self._optimizers = optimizers
+        self.skipped = skipped = self._skip[self._judged]
         self._judged += 1
-        values = [*self._losses, *(gradient for gradient in gradients if gradient is not None)]
         # torch's only kernel that goes through a list of tensors and leaves a single number: sets `skipped` to 1 where
-        # a value is not finite, and multiplies all of them. By 2^64, and what has no finite square has become infinite
-        # when it is asked the second time; and back, which is exact.
-        search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
-        for factor in self._there_and_back:
-            search(values, self.skipped, factor)
+        # a value is not finite, and multiplies all of them.
+        torch._amp_foreach_non_finite_check_and_unscale_(  # pyright: ignore[reportPrivateImportUsage]
+            [p.grad for p in parameters if p.grad is not None], skipped, self._smaller
+        )
         for optimizer in optimizers.values():
             if isinstance(optimizer, FusedAdam):
-                optimizer.refused = self.skipped
-        return self.skipped
+                optimizer.refused = skipped
+        return skipped
 
     def watch(self, optimizer: torch.optim.Optimizer) -> None:
         """Let an optimiser take no step that was judged to be skipped."""
@@ -153,14 +167,40 @@ class StepGuard:
             return f"{', '.join(values)} (the values themselves) and what follows from them were"
         present = [name for name, p in parameters if p.grad is not None]
         broken = [name for name, p in parameters if p.grad is not None and not torch.isfinite(p.grad).all()]
-        parts = [THE_LOSS] * (not all(torch.isfinite(loss) for loss in self._losses))
+        if still_there and self._loss is not None and not torch.isfinite(self._loss):
+            return f"{THE_LOSS} was"  # and with it every gradient
+        if not (broken and still_there):
+            return f"{THE_LOSS} or a gradient was"
         if len(broken) > 1 and broken == present:
-            parts.append("every gradient")
-        elif broken:
-            parts.append(f"the gradient of {', '.join(broken)}")
-        if not (parts and still_there):
-            return "the loss or a gradient was"
-        return f"{' and '.join(parts)} {'was' if len(parts) == 1 else 'were'}"
+            return "every gradient was"
+        return f"the gradient of {', '.join(broken)} was"
+
+
+class SeedingScaler(torch.amp.GradScaler):
+    """A GradScaler whose losses begin their backward pass with a guard's seed.
+
+    nerfstudio's trainer lets its own scale every loss, whether that one is enabled or not.
+    """
+
+    def __init__(self, guard: StepGuard, enabled: bool) -> None:
+        """Make a scaler; where it is not enabled, seeding is all that it does."""
+        super().__init__(enabled=enabled)
+        self._guard = guard
+
+    def scale(self, outputs: Tensor) -> SeededLoss:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The loss [] to go back from."""
+        return SeededLoss(super().scale(outputs), self._guard)
+
+
+class SeededLoss:
+    """A loss to go back from."""
+
+    def __init__(self, loss: Tensor, guard: StepGuard) -> None:
+        self._loss, self._guard = loss, guard
+
+    def backward(self) -> None:
+        """Add to the gradients what this loss, seeded, has to give."""
+        self._loss.backward(self._guard.seed(self._loss))
 
 
 def _forget(optimizer: torch.optim.Optimizer, *_: Any) -> None:

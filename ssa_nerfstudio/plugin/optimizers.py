@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
-from torch import Tensor
 from torch.nn import Parameter
 
 from ssa_nerfstudio.plugin.fused_adam import FusedAdam, count_steps
@@ -22,7 +20,6 @@ class JointOptimizers(Optimizers):
         config: dict[str, Any],
         param_groups: dict[str, list[Parameter]],
         guard: StepGuard | None,
-        losses: Callable[[], Sequence[Tensor]],
     ) -> None:
         """As nerfstudio's.
 
@@ -30,10 +27,9 @@ class JointOptimizers(Optimizers):
             config: by group, as in the trainer's configuration.
             param_groups: parameters by group.
             guard: None: every step is taken.
-            losses: the terms of the current step's loss, for the guard.
         """
         super().__init__(config, param_groups)
-        self.guard, self._losses = guard, losses
+        self.guard = guard
         self._quick: set[str] = set()
         """Groups of which nothing is asked but to step."""
         for name, optimizer in self.optimizers.items():
@@ -54,7 +50,7 @@ class JointOptimizers(Optimizers):
     def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
         """Judge the step, and step the groups."""
         optimizers = {name: self.optimizers[name] for name in param_groups}
-        refused = None if self.guard is None else self.guard.judge(self._losses(), optimizers)
+        refused = None if self.guard is None else self.guard.judge(optimizers)
         others = [name for name in param_groups if grad_scaler.is_enabled() or name not in self._quick]
         quick = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
         with torch.no_grad():

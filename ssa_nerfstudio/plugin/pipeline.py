@@ -66,12 +66,6 @@ class SSAPipeline(VanillaPipeline):
             self.model.start_outside_cameras(positions)
             self._set_overlays()
 
-    def get_train_loss_dict(self, step: int):
-        """Upstream's, with the loss kept for the guard that reads it before the optimisers step."""
-        outputs, losses, metrics = super().get_train_loss_dict(step)
-        self.losses = tuple(loss.detach() for loss in losses.values())
-        return outputs, losses, metrics
-
     def _set_overlays(self) -> None:
         setting = self.config.model.overlay
         resumed = saved_pipeline(self.config.artifacts_of) if self.config.artifacts_of else None

@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ssa_nerfstudio.errors import give_up, refuse, warn
 from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
 from ssa_nerfstudio.plugin.event_writers import spare_event_writers
-from ssa_nerfstudio.plugin.guards import READ_EVERY, StepGuard, first_not_finite
+from ssa_nerfstudio.plugin.guards import READ_EVERY, SeedingScaler, StepGuard, first_not_finite
 from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
 from ssa_nerfstudio.plugin.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
@@ -69,9 +69,11 @@ class SSATrainer(Trainer):
             means["optimizer"].lr *= scale
             means["scheduler"].lr_final *= scale
         model = self.config.pipeline.model
-        guard = StepGuard(model.max_skipped_steps) if model.guards else None
-        groups = self.pipeline.get_param_groups()
-        return JointOptimizers(self.config.optimizers.copy(), groups, guard, lambda: self.pipeline.losses)
+        guard = None
+        if model.guards:
+            guard = StepGuard(model.max_skipped_steps, exponent=0 if self.use_grad_scaler else 64)
+            self.grad_scaler = SeedingScaler(guard, self.use_grad_scaler)
+        return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), guard)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as upstream does, and say at the end of the training what became of the artifact.
@@ -159,7 +161,7 @@ class SSATrainer(Trainer):
         loss, losses, metrics = super().train_iteration(step)
         guard = self.optimizers.guard
         if guard is not None:
-            self.pipeline.model.info["skipped"] = guard.skipped
+            self.pipeline.model.info |= {"skipped": guard.skipped, "magnification": guard.magnification}
             if (step + 1) % READ_EVERY == 0:
                 guard.look(step)
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics

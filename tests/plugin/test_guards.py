@@ -19,8 +19,15 @@ from ssa_nerfstudio.benchmark.run import configure
 from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.fused_adam import FusedAdam
-from ssa_nerfstudio.plugin.guards import RANGE_EVERY, SCALE_RANGE, StepGuard, first_not_finite, keep_scales_in_range
-from ssa_nerfstudio.plugin.trainer import SSATrainer
+from ssa_nerfstudio.plugin.guards import (
+    RANGE_EVERY,
+    SCALE_RANGE,
+    SeededLoss,
+    StepGuard,
+    first_not_finite,
+    keep_scales_in_range,
+)
+from ssa_nerfstudio.plugin.trainer import SSATrainer, machine
 
 OVERLAYS = pytest.mark.parametrize("overlay", ["on", "off"])
 
@@ -50,7 +57,6 @@ def spoil(trainer: SSATrainer, steps: set[int] | range, what: str = "scales", va
         if step in steps and what == "loss":
             # A loss that is not finite without a gradient that is not: only the loss tells.
             losses["broken"] = losses["main_loss"].new_tensor(value)
-            pipeline.losses = (*pipeline.losses, losses["broken"])
         elif step in steps:
             parameter = pipeline.get_param_groups()[what][0]
             poison = torch.zeros_like(parameter)
@@ -132,7 +138,8 @@ def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_pa
     assert more["item"] == 0
     launched = more.total() - more["view"] - more["detach"] - more["alias"]
     fewer = counts[False] - counts[True]
-    assert launched - fewer.total() <= (5 if "mcmc" in method else 3)
+    # Begin with a seed instead of ones, search, and keep from counting; MCMC's noise waits for the judgement.
+    assert launched - fewer.total() <= (4 if "mcmc" in method else 2)
 
 
 @OVERLAYS
@@ -171,6 +178,15 @@ def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_gua
     assert not torch.isfinite(sums[False][2]["grad2d"]).all()
 
 
+def go_back(parameter: torch.nn.Parameter, gradient: Tensor, guard: StepGuard) -> None:
+    """Let a parameter have a gradient, as in a training."""
+    parameter.grad = None
+    loss = parameter.sum() * 0.0 + 1.0  # the gradient comes from the hook: products with numbers would round it
+    handle = parameter.register_hook(lambda ones: torch.full_like(ones, guard.magnification) * gradient)
+    SeededLoss(loss, guard).backward()
+    handle.remove()
+
+
 def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_or_break_its_element():
     parameter = torch.nn.Parameter(torch.zeros(3))
     optimizer = FusedAdam([parameter], lr=0.1, eps=1e-15)
@@ -180,8 +196,9 @@ def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_or
     guard.watch(optimizer)
     for largest in (1e22, 1.0, 1.0):
         gradient = torch.tensor([largest, 1.0, 1.0])
-        parameter.grad, frozen.grad = gradient.clone(), gradient.clone()
-        guard.judge([torch.tensor(1.0)], {"p": optimizer})
+        go_back(parameter, gradient, guard)
+        frozen.grad = gradient.clone()
+        guard.judge({"p": optimizer})
         optimizer.step()
         plain.step()
     torch.testing.assert_close(parameter.detach(), torch.full((3,), -0.2))
@@ -189,19 +206,44 @@ def test_a_gradient_whose_square_overflows_is_skipped_because_it_would_freeze_or
     assert torch.isinf(plain.state[frozen]["exp_avg_sq"][0])
 
 
-def test_what_has_a_finite_square_is_not_skipped_and_stays_what_it_was(capsys):
+def test_what_has_a_finite_square_is_not_skipped_and_is_judged_to_the_last_bit(capsys):
     parameter = torch.nn.Parameter(torch.zeros(3))
     optimizer = FusedAdam([parameter], lr=0.1)
     guard = StepGuard(limit=10)
     for largest, skipped in ((1.8e19, 0), (1.85e19, 1)):
         gradient = torch.tensor([-largest, 1.0, 1e-42])  # the last one is subnormal
-        parameter.grad = gradient.clone()
+        go_back(parameter, gradient, guard)
         assert bool(torch.isinf(gradient.square()).any()) == skipped
-        guard.judge([torch.tensor(1.0)], {"p": optimizer})
+        guard.judge({"p": optimizer})
         assert guard.skipped == skipped
+        assert parameter.grad is not None
         assert torch.equal(parameter.grad, gradient) != skipped
     guard.look(1)
     assert "the gradient of p was not finite" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 3e38])
+def test_the_backward_pass_begins_with_a_power_of_two_or_nothing_usable(value):
+    guard = StepGuard(limit=10)
+    parameter = torch.nn.Parameter(torch.tensor(1.0, device=machine().device_type))
+    SeededLoss(parameter + value, guard).backward()
+    assert bool(parameter.grad == 2.0**64) == math.isfinite(value)
+    guard.judge({"p": torch.optim.SGD([parameter], lr=0.1)})
+    assert guard.skipped == (not math.isfinite(value))
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="gsplat adds gradients up in any order")
+@OVERLAYS
+@pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
+def test_a_sound_training_is_the_same_to_the_last_bit_without_guards(tiny_scene, tmp_path, overlay, method):
+    """Gradients 2^64 times as large: nothing overflows on the way back, and nothing is rounded otherwise."""
+    states = {}
+    for guards in (True, False):
+        trainer = make(tiny_scene, tmp_path / str(guards), method=method, overlay=overlay, guards=guards)
+        states[guards] = after_each_step(trainer)
+        trainer.train()
+    assert changed(states[True][-1], states[False][-1]) == set()
+    assert changed(states[True][0], states[True][-1])
 
 
 @pytest.mark.parametrize("kind", ["ours", "fused", "foreach", "single", "sgd"])
@@ -215,7 +257,7 @@ def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
     else:
         fused, foreach = kind == "fused", kind == "foreach"
         optimizer = torch.optim.Adam([parameter], lr=0.1, fused=fused, foreach=None if fused else foreach)
-    guard = StepGuard(limit=10)
+    guard = StepGuard(limit=10, exponent=0)
     guard.watch(optimizer)
     grad_scaler = torch.amp.GradScaler("cpu", enabled=scaler, init_scale=4.0, growth_interval=1000)
     seen = []
@@ -224,7 +266,7 @@ def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
         # What breaks may belong to another optimiser: this one's gradient is fine and it must skip all the same.
         other = torch.nn.Parameter(torch.zeros(1))
         other.grad, parameter.grad = parameter.grad[:1].clone(), torch.ones(4) * (4.0 if scaler else 1.0)
-        guard.judge([torch.tensor(1.0)], {"p": optimizer, "other": torch.optim.SGD([other], lr=0.1)})
+        guard.judge({"p": optimizer, "other": torch.optim.SGD([other], lr=0.1)})
         grad_scaler.scale(torch.ones(()))  # a scaler makes its state on first use
         grad_scaler.step(optimizer)
         grad_scaler.update()
@@ -288,8 +330,17 @@ def test_if_all_breaks_all_is_named():
     optimizers = {name: torch.optim.SGD([p], lr=1.0) for name, p in zip("abc", parameters, strict=True)}
     for parameter in parameters[:2]:  # the third has none
         parameter.grad = torch.full((2,), math.inf)
-    guard.judge([torch.tensor(math.nan)], optimizers)
-    with pytest.raises(TrainingFailed, match="because the loss and every gradient were not finite"):
+    guard.judge(optimizers)
+    with pytest.raises(TrainingFailed, match="because every gradient was not finite"):
+        guard.look(0)
+
+
+def test_if_the_loss_breaks_it_alone_is_named():
+    guard = StepGuard(limit=1)
+    parameters = [torch.nn.Parameter(torch.ones(2)) for _ in range(2)]
+    SeededLoss((parameters[0] + parameters[1]).sum() * math.inf, guard).backward()
+    guard.judge({name: torch.optim.SGD([p], lr=1.0) for name, p in zip("ab", parameters, strict=True)})
+    with pytest.raises(TrainingFailed, match="because the loss was not finite"):
         guard.look(0)
 
 
@@ -299,7 +350,7 @@ def test_a_row_of_skipped_steps_is_counted_across_looks():
     optimizers: dict[str, torch.optim.Optimizer] = {"p": torch.optim.SGD([parameter], lr=1.0)}
     for step in range(200):
         parameter.grad = torch.full((2,), math.inf if 85 <= step < 115 else 1.0)
-        guard.judge([torch.tensor(1.0)], optimizers)
+        guard.judge(optimizers)
         if step == 99:
             assert guard.look(step) == 15
     with pytest.raises(TrainingFailed, match="from step 85 on"):
@@ -313,7 +364,7 @@ def test_the_culprit_is_the_parameter_whose_value_broke():
     for parameter in (broken, fine):
         parameter.grad = torch.full((2,), math.nan)
     optimizers = {name: torch.optim.SGD([p], lr=1.0) for name, p in (("b", broken), ("f", fine))}
-    guard.judge([torch.tensor(math.nan)], optimizers)
+    guard.judge(optimizers)
     with pytest.raises(TrainingFailed, match=r"b \(the values themselves\)"):
         guard.look(0)
 
@@ -454,6 +505,6 @@ def test_the_guard_never_waits_for_the_device_between_two_looks():
             patch.setattr(Tensor, name, asked)
         for value in (1.0, math.nan, 1.0):
             parameter.grad = torch.full((3,), value)
-            guard.judge([torch.ones(())], {"p": optimizer})
+            guard.judge({"p": optimizer})
             optimizer.step()
     assert guard.look(2) == 1

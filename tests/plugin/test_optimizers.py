@@ -28,7 +28,7 @@ def joint(guard: StepGuard | None = None, max_norm: float | None = None) -> tupl
         for name in "ab"
     }
     groups = {name: [parameter] for name, parameter in zip("ab", parameters, strict=True)}
-    return JointOptimizers(config, groups, guard, lambda: [torch.zeros(())]), parameters
+    return JointOptimizers(config, groups, guard), parameters
 
 
 def counts(optimizers: JointOptimizers) -> list[float]:
@@ -37,7 +37,7 @@ def counts(optimizers: JointOptimizers) -> list[float]:
 
 def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
     """A rig: each camera's overlay has gradients at steps of its own; a skip belongs to the step it happened at."""
-    guard = StepGuard(limit=100)
+    guard = StepGuard(limit=100, exponent=0)
     optimizers, (a, b) = joint(guard)
     for step in range(12):
         optimizers.zero_grad_some(["a", "b"])
@@ -55,7 +55,7 @@ def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
 
 @pytest.mark.parametrize("guarded", [True, False])
 def test_what_a_group_asks_of_its_gradients_is_done(guarded):
-    optimizers, (a, b) = joint(StepGuard(limit=100) if guarded else None, max_norm=0.5)
+    optimizers, (a, b) = joint(StepGuard(limit=100, exponent=0) if guarded else None, max_norm=0.5)
     a.grad, b.grad = torch.full((3,), 10.0), torch.full((3,), 0.1)
     optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
     assert a.grad.norm() == pytest.approx(0.5, rel=1e-4)
@@ -86,14 +86,14 @@ def test_schedulers_find_optimisers_that_have_stepped():
 
 
 def test_a_look_with_nothing_judged_forgets_no_row_and_names_nothing_it_cannot_know(capsys):
-    guard = StepGuard(limit=20)
+    guard = StepGuard(limit=20, exponent=0)
     parameters = {name: torch.nn.Parameter(torch.zeros(2)) for name in "ab"}
     plain = {name: torch.optim.Adam([parameter]) for name, parameter in parameters.items()}
     for optimizer in plain.values():
         guard.watch(optimizer)
     for _ in range(10):
         parameters["a"].grad, parameters["b"].grad = torch.full((2,), math.nan), torch.ones(2)
-        guard.judge([torch.zeros(())], plain)
+        guard.judge(plain)
         for optimizer in plain.values():
             optimizer.step()  # kept from its gradient
     assert guard.look(9) == 10
@@ -101,9 +101,9 @@ def test_a_look_with_nothing_judged_forgets_no_row_and_names_nothing_it_cannot_k
     assert guard.look(9) == 0
     for _ in range(9):
         parameters["a"].grad = torch.full((2,), math.nan)
-        guard.judge([torch.zeros(())], plain)
+        guard.judge(plain)
     assert guard.look(18) == 9
     parameters["a"].grad = torch.full((2,), math.nan)
-    guard.judge([torch.zeros(())], plain)
+    guard.judge(plain)
     with pytest.raises(TrainingFailed, match="from step 0 on, were skipped because the gradient of a was"):
         guard.look(19)
