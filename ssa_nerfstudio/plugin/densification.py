@@ -86,6 +86,19 @@ class AdaptiveDensityControl(DefaultStrategy):
         return super()._prune_gs(params, optimizers, state, step)
 
 
+class RateUnlessSkipped:
+    """A learning rate that is 0 at a skipped step. gsplat multiplies it by the noise's before it uses it: one kernel
+    for both."""
+
+    def __init__(self, rate: float, skipped: Tensor) -> None:
+        self._rate, self._skipped = rate, skipped
+
+    def __mul__(self, factor: float) -> Tensor:
+        """The product with a number, []."""
+        rate = self._rate * factor
+        return torch.rsub(self._skipped, rate, alpha=rate)
+
+
 @dataclass
 class MarkovChainMonteCarlo(MCMCStrategy):
     """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians move to living ones, up to a fixed number."""
@@ -111,7 +124,7 @@ class MarkovChainMonteCarlo(MCMCStrategy):
         """Relocate, add and perturb; the noise follows the current learning rate of the means."""
         lr: Any = optimizers["means"].param_groups[0]["lr"]
         if self.guarded and info.get("skipped") is not None:
-            lr = torch.rsub(info["skipped"], lr, alpha=lr)
+            lr = RateUnlessSkipped(lr, info["skipped"])
         super().step_post_backward(params, optimizers, state, step, info, lr=lr)
 
     @torch.no_grad()

@@ -50,7 +50,7 @@ class FusedAdam(torch.optim.Adam):
         refused = self.refused
         if overflow is not None:
             refused = overflow if refused is None else torch.maximum(overflow, refused)
-        count_steps(self.counters(), None if refused is None else 1 - refused)
+        count_steps(self.counters(), 1 if refused is None else 1 - refused)
         self.update(refused, scale)
 
     def update(self, refused: Tensor | None, scale: Tensor | None = None) -> None:
@@ -92,11 +92,11 @@ class FusedAdam(torch.optim.Adam):
         return state
 
 
-def count_steps(counters: list[Tensor], taken: Tensor | None) -> None:
-    """Add 1 to numbers of steps, or what is `taken` [], on the device; in one kernel.
+def count_steps(counters: list[Tensor], more: float | Tensor = 1) -> None:
+    """Add to numbers of steps; in one kernel, and on the device where `more` [] is there.
 
-    A list of it, because torch would read a tensor without dimensions from the device to use it as a number.
+    A list of it then, because torch would read a tensor without dimensions from the device to use it as a number.
     """
     if counters:
-        more = 1 if taken is None else [taken.reshape(())] * len(counters)
-        torch._foreach_add_(counters, more)  # pyright: ignore[reportPrivateImportUsage]
+        each = [more.reshape(())] * len(counters) if isinstance(more, Tensor) else more
+        torch._foreach_add_(counters, each)  # pyright: ignore[reportPrivateImportUsage]

@@ -123,20 +123,23 @@ class StepGuard:
                 for parameter in group["params"]:
                     parameter.grad = None
 
-    def look(self, step: int) -> int:
-        """Read what became of the steps since the last look: the number of skipped ones.
+    def look(self, step: int) -> list[int]:
+        """Read what became of the steps since the last look.
+
+        Returns:
+            Which of them were skipped; the first is 0.
 
         Raises:
             TrainingFailed: where `limit` steps in a row, up to any of them, were skipped.
         """
         if not self._judged:
-            return 0
+            return []
         skips = self._skips[: self._judged].tolist()
         self._judged = 0
-        skipped = int(sum(skips))
+        skipped = [at for at, skip in enumerate(skips) if skip]
         if not skipped:
             self._row = 0
-            return 0
+            return []
         culprits = self._culprits(bool(skips[-1]))
         for at, skip in enumerate(skips, start=step + 1 - len(skips)):
             if not skip:
@@ -151,7 +154,7 @@ class StepGuard:
                     f"were skipped because {culprits} not finite; resume from an earlier checkpoint (--load-dir) "
                     "with lower learning rates"
                 )
-        warn(f"{skipped} of the {len(skips)} steps up to {step} were skipped: {culprits} not finite")
+        warn(f"{len(skipped)} of the {len(skips)} steps up to {step} were skipped: {culprits} not finite")
         return skipped
 
     def _culprits(self, still_there: bool) -> str:
@@ -200,7 +203,7 @@ class SeededLoss:
 
     def backward(self) -> None:
         """Add to the gradients what this loss, seeded, has to give."""
-        self._loss.backward(self._guard.seed(self._loss))
+        torch.autograd.backward((self._loss,), (self._guard.seed(self._loss),))
 
 
 def _forget(optimizer: torch.optim.Optimizer, *_: Any) -> None:

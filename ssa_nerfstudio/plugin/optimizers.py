@@ -6,6 +6,7 @@ from typing import Any
 
 import torch
 from nerfstudio.engine.optimizers import Optimizers
+from torch import Tensor
 from torch.nn import Parameter
 
 from ssa_nerfstudio.plugin.fused_adam import FusedAdam, count_steps
@@ -30,6 +31,8 @@ class JointOptimizers(Optimizers):
         """
         super().__init__(config, param_groups)
         self.guard = guard
+        self._counted: list[list[Tensor]] = []
+        """The numbers of steps that went up at every judged step since the last look."""
         self._quick: set[str] = set()
         """Groups of which nothing is asked but to step."""
         for name, optimizer in self.optimizers.items():
@@ -55,8 +58,23 @@ class JointOptimizers(Optimizers):
         quick = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
         with torch.no_grad():
             counters = [counter for optimizer in quick for counter in optimizer.counters()]
-            count_steps(counters, None if refused is None else 1 - refused)
+            count_steps(counters)
             for optimizer in quick:
                 optimizer.update(refused)
+        if refused is not None:
+            self._counted.append(counters)
         if others:
             super().optimizer_scaler_step_some(grad_scaler, others)
+
+    def look(self, step: int) -> None:
+        """Let the guard look, and take back the count of steps that it skipped.
+
+        Until here, at most `READ_EVERY` steps, Adam has taken them for steps: its bias correction is then nearer to
+        none than it should be. To count what the device decides costs a kernel a step.
+        """
+        if self.guard is None:
+            return
+        skipped, counted = self.guard.look(step), self._counted
+        self._counted = []
+        for at in skipped:
+            count_steps(counted[at], -1)

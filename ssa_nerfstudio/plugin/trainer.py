@@ -129,8 +129,7 @@ class SSATrainer(Trainer):
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint, whole and finite or not at all; older ones go only when it is there."""
-        if self.optimizers.guard is not None:
-            self.optimizers.guard.look(step)
+        self.optimizers.look(step)
         states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
         broken = first_not_finite({**self.pipeline.state_dict(), **states})
         if broken is not None:
@@ -163,7 +162,7 @@ class SSATrainer(Trainer):
         if guard is not None:
             self.pipeline.model.info |= {"skipped": guard.skipped, "magnification": guard.magnification}
             if (step + 1) % READ_EVERY == 0:
-                guard.look(step)
+                self.optimizers.look(step)
         return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:
