@@ -29,6 +29,9 @@ SCALE_RANGE = (1e-8, 1e4)
 START_DISTANCE = NEAR_PLANE
 """A start point nearer to a camera than this (world units) is inside it: that camera can never draw it."""
 
+TOO_LARGE = 2.0**64
+"""Gradients times this overflow in float32 where their squares do: its largest number is just below 2^128."""
+
 THE_LOSS = "the loss"
 LONELY_SIZE = 0.01
 """Size (world units) of start points that all lie in one place."""
@@ -46,16 +49,16 @@ class StepGuard:
     through the gradients, which makes them what they were. Powers of two, so that nothing is rounded.
     """
 
-    def __init__(self, limit: int, exponent: int = 64) -> None:
+    def __init__(self, limit: int, magnified: bool = True) -> None:
         """Make a guard.
 
         Args:
             limit: so many skipped steps in a row end the training, at the host's next look.
-            exponent: gradients come out of the backward pass 2^exponent times as large. 64 is half of what float32 has,
-                so that squares are looked after; 0 for gradients of half precision or from elsewhere.
+            magnified: gradients come out of the backward pass `TOO_LARGE` times as large. False where they must not,
+                because they have half precision or add up over several steps; then a second search makes them so.
         """
         self.limit = limit
-        self.magnification = 2.0**exponent
+        self.magnification = TOO_LARGE if magnified else 1.0
         """How much too large gradients are between the backward pass and the judgement."""
         self.skipped: Tensor | None = None
         """1 where the current step is skipped, else 0: one float tensor on the device; None before the first step."""
@@ -77,8 +80,8 @@ class StepGuard:
         """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device.
 
         Args:
-            optimizers: by name. Their gradients become `magnification` times smaller, in place: no two may share
-                memory.
+            optimizers: all of them by name, whether they step now or gather gradients for later. Gradients become
+                `magnification` times smaller, in place: no two may share memory.
 
         Returns:
             What `skipped` is from now on.
@@ -88,15 +91,17 @@ class StepGuard:
         if self._judged == 0:
             self._skips = parameters[0].new_zeros(READ_EVERY, dtype=torch.float32)
             self._skip = self._skips.unbind()
-            self._smaller = torch.full_like(self._skip[0], 1 / self.magnification)
+            down = torch.full_like(self._skip[0], 1 / TOO_LARGE)
+            self._factors = [down] if self.magnification == TOO_LARGE else [1 / down, down]
         self._optimizers = optimizers
         self.skipped = skipped = self._skip[self._judged]
         self._judged += 1
+        gradients = [p.grad for p in parameters if p.grad is not None]
         # torch's only kernel that goes through a list of tensors and leaves a single number: sets `skipped` to 1 where
         # a value is not finite, and multiplies all of them.
-        torch._amp_foreach_non_finite_check_and_unscale_(  # pyright: ignore[reportPrivateImportUsage]
-            [p.grad for p in parameters if p.grad is not None], skipped, self._smaller
-        )
+        search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
+        for factor in self._factors:
+            search(gradients, skipped, factor)
         for optimizer in optimizers.values():
             if isinstance(optimizer, FusedAdam):
                 optimizer.refused = skipped
@@ -185,9 +190,9 @@ class SeedingScaler(torch.amp.GradScaler):
     nerfstudio's trainer lets its own scale every loss, whether that one is enabled or not.
     """
 
-    def __init__(self, guard: StepGuard, enabled: bool) -> None:
+    def __init__(self, guard: StepGuard, enabled: bool, device: str = "cuda") -> None:
         """Make a scaler; where it is not enabled, seeding is all that it does."""
-        super().__init__(enabled=enabled)
+        super().__init__(device, enabled=enabled)
         self._guard = guard
 
     def scale(self, outputs: Tensor) -> SeededLoss:  # pyright: ignore[reportIncompatibleMethodOverride]

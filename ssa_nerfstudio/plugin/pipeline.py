@@ -40,8 +40,6 @@ class SSAPipeline(VanillaPipeline):
     config: SSAPipelineConfig
     datamanager: SSADatamanager
     model: SSASplatfactoModel
-    losses: tuple[torch.Tensor, ...]
-    """The terms of the last loss, cut off from the graph."""
 
     def __init__(
         self,

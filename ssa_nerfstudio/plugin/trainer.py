@@ -71,8 +71,10 @@ class SSATrainer(Trainer):
         model = self.config.pipeline.model
         guard = None
         if model.guards:
-            guard = StepGuard(model.max_skipped_steps, exponent=0 if self.use_grad_scaler else 64)
-            self.grad_scaler = SeedingScaler(guard, self.use_grad_scaler)
+            scaling = self.grad_scaler.is_enabled()
+            gathering = any(steps > 1 for steps in self.gradient_accumulation_steps.values())
+            guard = StepGuard(model.max_skipped_steps, magnified=not (scaling or gathering))
+            self.grad_scaler = SeedingScaler(guard, scaling)
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), guard)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:

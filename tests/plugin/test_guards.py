@@ -23,6 +23,7 @@ from ssa_nerfstudio.plugin.guards import (
     RANGE_EVERY,
     SCALE_RANGE,
     SeededLoss,
+    SeedingScaler,
     StepGuard,
     first_not_finite,
     keep_scales_in_range,
@@ -32,10 +33,13 @@ from ssa_nerfstudio.plugin.trainer import SSATrainer, machine
 OVERLAYS = pytest.mark.parametrize("overlay", ["on", "off"])
 
 
-def make(data, output, steps: int = 4, method: str = "ssa-splatfacto", **model) -> SSATrainer:
-    """A trainer that has been set up and has not begun."""
+def make(data, output, steps: int = 4, method: str = "ssa-splatfacto", **settings) -> SSATrainer:
+    """A trainer that has been set up and has not begun; settings of the trainer and of the model."""
     torch.manual_seed(0)
-    config = configure(method, data, output, steps, {"num_downscales": 0, **model})
+    own = {name: settings.pop(name) for name in ("use_grad_scaler", "gradient_accumulation_steps") if name in settings}
+    config = configure(method, data, output, steps, {"num_downscales": 0, **settings})
+    for name, value in own.items():
+        setattr(config, name, value)
     config.scale_schedules = False  # of a few steps, the densification's statistics would end at once
     config.set_timestamp()
     config.viewer.quit_on_train_completion = True
@@ -154,10 +158,11 @@ def test_without_the_guard_such_a_step_spoils_the_parameters(tiny_scene, tmp_pat
     assert not torch.isfinite(states[2]["_model.gauss_params.scales"]).all()
 
 
-def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_guard(tiny_scene, tmp_path):
+@OVERLAYS
+def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_guard(tiny_scene, tmp_path, overlay):
     sums = {}
     for guards in (True, False):
-        trainer = make(tiny_scene, tmp_path / str(guards), guards=guards)
+        trainer = make(tiny_scene, tmp_path / str(guards), guards=guards, overlay=overlay)
         spoil(trainer, {2}, "loss", math.nan)
         original = trainer.pipeline.model._render
 
@@ -258,7 +263,7 @@ def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
     else:
         fused, foreach = kind == "fused", kind == "foreach"
         optimizer = torch.optim.Adam([parameter], lr=0.1, fused=fused, foreach=None if fused else foreach)
-    guard = StepGuard(limit=10, exponent=0)
+    guard = StepGuard(limit=10, magnified=False)
     guard.watch(optimizer)
     grad_scaler = torch.amp.GradScaler("cpu", enabled=scaler, init_scale=4.0, growth_interval=1000)
     seen = []
@@ -274,6 +279,92 @@ def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
         seen.append(parameter.detach().clone())
     assert torch.equal(seen[0], seen[1])
     assert (seen[2] < seen[1]).all()
+
+
+def test_what_a_gradient_scaler_finds_by_itself_is_skipped_too():
+    parameter = torch.nn.Parameter(torch.ones(4))
+    optimizer = torch.optim.Adam([parameter], lr=0.1, fused=True)
+    guard = StepGuard(limit=10, magnified=False)
+    guard.watch(optimizer)
+    parameter.grad = torch.ones(4)
+    assert guard.judge({"p": optimizer}) == 0
+    optimizer.found_inf = torch.ones(())  # pyright: ignore[reportAttributeAccessIssue] - as GradScaler.step sets it
+    optimizer.step()
+    assert torch.equal(parameter, torch.ones(4))
+
+
+@pytest.mark.parametrize("magnified", [True, False])
+def test_a_loss_is_scaled_and_seeded(magnified):
+    """nerfstudio's own scaler is enabled for mixed precision only, and on CUDA only."""
+    guard = StepGuard(limit=10, magnified=magnified)
+    parameter = torch.nn.Parameter(torch.tensor(3.0))
+    scaler = SeedingScaler(guard, enabled=True, device="cpu")
+    scaler.scale(2 * parameter).backward()
+    assert parameter.grad == 2 * scaler.get_scale() * guard.magnification
+    guard.judge({"p": torch.optim.SGD([parameter], lr=0.1)})
+    assert parameter.grad == 2 * scaler.get_scale()
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_gradients_of_half_precision_are_not_magnified(tiny_scene, tmp_path, asked):
+    trainer = make(tiny_scene, tmp_path, use_grad_scaler=asked)
+    scaling = asked and torch.cuda.is_available()  # elsewhere torch's scaler says that it is off
+    guard = trainer.optimizers.guard
+    assert guard is not None
+    assert (guard.magnification == 1) == scaling
+    assert trainer.grad_scaler.is_enabled() == scaling
+    trainer.train()
+    assert guard.skipped == 0
+
+
+@OVERLAYS
+@pytest.mark.parametrize("what", ["quats", "means", "loss", "large"])
+def test_where_gradients_add_up_a_broken_step_is_skipped_by_those_too_that_only_gather(
+    tiny_scene, tmp_path, overlay, what
+):
+    """Step 2 is one at which quaternions gather: a step of theirs is every second."""
+    trainer = make(tiny_scene, tmp_path, overlay=overlay, gradient_accumulation_steps={"quats": 2})
+    spoil(trainer, {2}, "quats" if what == "large" else what, 1e25 if what == "large" else math.nan)
+    states = after_each_step(trainer)
+    trainer.train()
+    assert changed(states[1], states[2]) == set()
+    assert {"_model.gauss_params.quats", "_model.gauss_params.means"} <= changed(states[0], states[1])
+    assert first_not_finite(states[3]) is None
+
+
+def test_a_training_in_which_nothing_steps_at_first_is_guarded_as_well(tiny_scene, tmp_path):
+    every = dict.fromkeys(("means", "scales", "quats", "features_dc", "features_rest", "opacities", "overlay"), 2)
+    states = {}
+    for guards in (True, False):
+        trainer = make(tiny_scene, tmp_path / str(guards), guards=guards, gradient_accumulation_steps=every)
+        states[guards] = after_each_step(trainer)
+        trainer.train()
+    assert "_model.gauss_params.means" not in changed(states[True][1], states[True][2])
+    if not torch.cuda.is_available():  # gsplat adds gradients up in any order
+        assert changed(states[True][-1], states[False][-1]) == set()
+
+
+@pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
+def test_counts_are_right_after_a_window_of_skips_and_refinements(tiny_scene, tmp_path, method):
+    settings = {"refine_every": 10, "warmup_length": 5, "stop_split_at": 100, "mcmc_stop_at": 100}
+    trainer = make(tiny_scene, tmp_path, steps=100, method=method, max_skipped_steps=10, **settings)
+    broken = {0, 3, 4, 10, 11, 19, 20, 21, 50, 55, 97, 99}
+    spoil(trainer, broken, "scales")
+    trainer.train()
+    steps = {float(v["step"]) for o in trainer.optimizers.optimizers.values() for v in o.state.values()}
+    assert steps == {100 - len(broken)}
+
+
+def test_a_checkpoint_between_two_looks_holds_the_steps_that_were_taken(tiny_scene, tmp_path):
+    trainer = make(tiny_scene, tmp_path, steps=12)
+    trainer.config.steps_per_save, trainer.config.save_only_latest_checkpoint = 7, False
+    spoil(trainer, {3, 5, 10}, "scales")
+    trainer.train()
+    counts = {}
+    for path in trainer.checkpoint_dir.iterdir():
+        saved = torch.load(path, weights_only=False)
+        counts[saved["step"]] = {float(v["step"]) for o in saved["optimizers"].values() for v in o["state"].values()}
+    assert counts == {7: {6}, 11: {9}}
 
 
 def test_optimisers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_path):
@@ -469,8 +560,9 @@ def test_start_points_inside_a_camera_are_left_out(tiny_scene, tmp_path, overlay
     trainer.train()
 
 
-def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tmp_path, capsys):
-    trainer = make(tiny_scene, tmp_path)
+@OVERLAYS
+def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tmp_path, capsys, overlay):
+    trainer = make(tiny_scene, tmp_path, overlay=overlay)
     trainer.save_checkpoint(0)
     with torch.no_grad():
         trainer.pipeline.model.quats[3, 1] = math.inf
@@ -480,8 +572,9 @@ def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tm
     assert "_model.gauss_params.quats" in capsys.readouterr().err
 
 
-def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys):
-    trainer = make(tiny_scene, tmp_path, steps=2)
+@OVERLAYS
+def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys, overlay):
+    trainer = make(tiny_scene, tmp_path, steps=2, overlay=overlay)
     trainer.train()
     means = trainer.optimizers.optimizers["means"]
     means.state[means.param_groups[0]["params"][0]]["exp_avg_sq"][0] = math.inf

@@ -37,7 +37,7 @@ def counts(optimizers: JointOptimizers) -> list[float]:
 
 def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
     """A rig: each camera's overlay has gradients at steps of its own; a skip belongs to the step it happened at."""
-    guard = StepGuard(limit=100, exponent=0)
+    guard = StepGuard(limit=100, magnified=False)
     optimizers, (a, b) = joint(guard)
     for step in range(12):
         optimizers.zero_grad_some(["a", "b"])
@@ -47,6 +47,10 @@ def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
         optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
     assert counts(optimizers) == [6, 6]
     optimizers.look(11)
+    optimizers.zero_grad_some(["a", "b"])
+    a.grad = torch.full((3,), math.nan)  # another window; b was first in the one before
+    optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
+    optimizers.look(12)
     assert counts(optimizers) == [3, 6]
     assert torch.isfinite(a).all()
     optimizers.zero_grad_some(["a", "b"])
@@ -56,7 +60,7 @@ def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
 
 @pytest.mark.parametrize("guarded", [True, False])
 def test_what_a_group_asks_of_its_gradients_is_done(guarded):
-    optimizers, (a, b) = joint(StepGuard(limit=100, exponent=0) if guarded else None, max_norm=0.5)
+    optimizers, (a, b) = joint(StepGuard(limit=100, magnified=False) if guarded else None, max_norm=0.5)
     a.grad, b.grad = torch.full((3,), 10.0), torch.full((3,), 0.1)
     optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
     assert a.grad.norm() == pytest.approx(0.5, rel=1e-4)
@@ -87,7 +91,7 @@ def test_schedulers_find_optimisers_that_have_stepped():
 
 
 def test_a_look_with_nothing_judged_forgets_no_row_and_names_nothing_it_cannot_know(capsys):
-    guard = StepGuard(limit=20, exponent=0)
+    guard = StepGuard(limit=20, magnified=False)
     parameters = {name: torch.nn.Parameter(torch.zeros(2)) for name in "ab"}
     plain = {name: torch.optim.Adam([parameter]) for name, parameter in parameters.items()}
     for optimizer in plain.values():
