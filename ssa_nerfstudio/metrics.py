@@ -9,6 +9,8 @@ import torch
 from pytorch_msssim import ssim as windowed_ssim
 from torch import Tensor
 
+from ssa_nerfstudio.flip_error import flip_error
+
 SSIM_WINDOW = 11
 """Side of the Gaussian window of `ssim`, in pixels."""
 SSIM_SIGMA = 1.5
@@ -79,13 +81,18 @@ def flip(render: Tensor, target: Tensor) -> float:
     Raises:
         ValueError: as `psnr`.
     """
-    # Checked before the call, because the evaluator ends the process on bad arguments.
-    render, target = _image_pair(render, target)
-    import flip_evaluator
+    return flip_error(*flip_arrays(render, target))
 
+
+def flip_arrays(render: Tensor, target: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The two images [H, W, 3] as `flip_error` takes them, reference first.
+
+    Raises:
+        ValueError: as `psnr`.
+    """
+    render, target = _image_pair(render, target)
     reference, test = (np.ascontiguousarray(image.float().cpu().numpy()) for image in (target, render))
-    _, mean_error, _ = flip_evaluator.evaluate(reference, test, "LDR", applyMagma=False)
-    return float(mean_error)
+    return reference, test
 
 
 def mean_colour_deviation(render: Tensor, target: Tensor) -> float:

@@ -19,6 +19,8 @@ from ssa_nerfstudio.benchmark.workplace import Workplace
 
 POLL = 0.2
 """Seconds between looks at the processes."""
+FLIP_PROCESSES = 8
+"""At most so many compare the views of one run."""
 PATIENCE = 10.0
 """Seconds that a process asked to end has before it is killed."""
 
@@ -114,9 +116,21 @@ class Local:
         self.processes.clear()
 
     def _start(self, run: Run, device: str | None) -> Process:
-        request = Request(run, str(self.place.folder), self.runs_per_device, self.command(run), self.keep_models)
+        request = Request(
+            run,
+            str(self.place.folder),
+            self.runs_per_device,
+            self.command(run),
+            self.keep_models,
+            self._flip_processes(),
+        )
         popen = start(request, device)
         return Process(run, device, popen, time.monotonic(), self.place.running(run.id) / PROGRESS)
+
+    def _flip_processes(self) -> int:
+        """What the cores allow; 1 without a GPU, where a view takes longer to render than to compare."""
+        at_once = len(self.devices) * self.runs_per_device
+        return max(1, min(FLIP_PROCESSES, (os.cpu_count() or 1) // at_once)) if at_once else 1
 
     def _result(self, run: Run) -> Result | None:
         return finish(self.place, run)

@@ -9,6 +9,7 @@ import resource
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, cast
 
@@ -21,9 +22,11 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from ssa_nerfstudio.benchmark.flip_processes import FlipProcesses
 from ssa_nerfstudio.benchmark.machine import versions
 from ssa_nerfstudio.errors import TrainingFailed
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
+from ssa_nerfstudio.plugin.figures import figures_but_flip
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
@@ -110,6 +113,7 @@ def train_and_evaluate(
     on_step: Callable[[int], None] = lambda step: None,
     marks: tuple[int, ...] = (),
     test_scale: float | None = None,
+    flip_processes: int = 1,
 ) -> tuple[Outcome, SSAPipeline, Path]:
     """Train a configuration to its end and evaluate every test view.
 
@@ -117,6 +121,7 @@ def train_and_evaluate(
         on_step: called with the number of finished steps.
         marks: steps after which the test views are evaluated too, with the clock stopped.
         test_scale: test photos are resized by this, training photos by the configuration's own.
+        flip_processes: processes that compare views by FLIP.
 
     Returns:
         The outcome, the trained pipeline, and the run's config.yml for `ns-eval`, `ns-export`, `ns-viewer`.
@@ -131,6 +136,7 @@ def train_and_evaluate(
     torch.manual_seed(seed)
     config.set_timestamp()
     quiet, CONSOLE.quiet = CONSOLE.quiet, True
+    flips = FlipProcesses(flip_processes)
     try:
         config.save_config()
         # Not in config.yml, which other commands load.
@@ -140,7 +146,8 @@ def train_and_evaluate(
         writer.EVENT_WRITERS.clear()  # nobody reads them, and the viewer that they stand in for has none
         pipeline = cast(_TimedPipeline, trainer.pipeline)
         pipeline.read_photos(test_scale)
-        clock = _Clock(pipeline, config.max_num_iterations, marks, on_step)
+        judge = partial(evaluate, pipeline, flips)
+        clock = _Clock(pipeline, config.max_num_iterations, marks, on_step, judge)
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], clock.after_step))
         if clock.cuda:
             torch.cuda.reset_peak_memory_stats()
@@ -149,9 +156,10 @@ def train_and_evaluate(
         clock.start()
         _train(trainer)
         began = time.perf_counter()
-        views = clock.views if config.max_num_iterations in marks else evaluate(pipeline)
+        views = clock.views if config.max_num_iterations in marks else judge()
         evaluated = clock.paused + time.perf_counter() - began
     finally:
+        flips.close()
         CONSOLE.quiet = quiet
         # nerfstudio keeps its event writers in globals: the next run in this process starts with none.
         writer.EVENT_WRITERS.clear()
@@ -175,7 +183,7 @@ def train_and_evaluate(
 
 
 @torch.no_grad()
-def evaluate(pipeline: SSAPipeline) -> dict[str, dict[str, float]]:
+def evaluate(pipeline: SSAPipeline, flips: FlipProcesses) -> dict[str, dict[str, float]]:
     """Metrics of each test view by its file's name.
 
     Raises:
@@ -184,12 +192,14 @@ def evaluate(pipeline: SSAPipeline) -> dict[str, dict[str, float]]:
     _require_alive(pipeline.model)
     pipeline.eval()
     names = [path.name for path in pipeline.datamanager.eval_dataset.image_filenames]
-    views = {}
+    views, waiting = {}, {}
     for name, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
         outputs = pipeline.model.get_outputs_for_camera(camera)
-        views[name], _ = pipeline.model.get_image_metrics_and_images(outputs, batch)
+        target = pipeline.model.target(outputs, batch)
+        waiting[name] = flips.submit(outputs["rgb"], target)
+        views[name] = figures_but_flip(outputs, target)
     pipeline.train()
-    return views
+    return {name: {**views[name], "flip": flip.result()} for name, flip in waiting.items()}
 
 
 def mean(views: dict[str, dict[str, float]]) -> dict[str, float]:
@@ -233,13 +243,19 @@ class _Clock:
     """Seconds of training, stopped while test views are evaluated."""
 
     def __init__(
-        self, pipeline: _TimedPipeline, steps: int, marks: tuple[int, ...], on_step: Callable[[int], None]
+        self,
+        pipeline: _TimedPipeline,
+        steps: int,
+        marks: tuple[int, ...],
+        on_step: Callable[[int], None],
+        judge: Callable[[], dict[str, dict[str, float]]],
     ) -> None:
         self.cuda = pipeline.model.device.type == "cuda"
         self.training = self.paused = self.peak_memory_mb = 0.0
         self.curve: list[dict[str, float]] = []
         self.views: dict[str, dict[str, float]] = {}
-        self._pipeline, self._steps, self._marks, self._on_step = pipeline, steps, set(marks), on_step
+        self._pipeline, self._steps, self._marks = pipeline, steps, set(marks)
+        self._on_step, self._judge = on_step, judge
 
     def start(self) -> None:
         """Start counting."""
@@ -258,7 +274,7 @@ class _Clock:
         else:
             self.peak_memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
         if done in self._marks:
-            self.views = evaluate(self._pipeline)
+            self.views = self._judge()
             seconds = self._pipeline.statistics_seconds + self.training
             gaussians = self._pipeline.model.num_points
             self.curve.append({"step": done, "seconds": seconds, "gaussians": gaussians, **mean(self.views)})

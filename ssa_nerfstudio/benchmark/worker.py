@@ -6,16 +6,15 @@ import contextlib
 import dataclasses
 import datetime
 import json
-import os
 import shutil
 import sys
-import threading
 import time
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ssa_nerfstudio.benchmark.parent import end_with_parent
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import Result, write
 from ssa_nerfstudio.benchmark.workplace import Workplace
@@ -53,6 +52,8 @@ class Request:
     """What repeats the run."""
     keep_models: bool = False
     """Keep nerfstudio's folder with config.yml and checkpoint in `models/`."""
+    flip_processes: int = 1
+    """Processes that compare views by FLIP."""
 
     def store(self, path: Path) -> None:
         """Write for the process to read."""
@@ -86,7 +87,9 @@ def work(request: Request) -> Result:
         note.stage("photos")
         imports = time.time() - psutil.Process().create_time()
         try:
-            outcome, pipeline, _ = training.train_and_evaluate(config, note.step, run.marks, test_scale=1.0)
+            outcome, pipeline, _ = training.train_and_evaluate(
+                config, note.step, run.marks, test_scale=1.0, flip_processes=request.flip_processes
+            )
         except training.Diverged as error:
             result.status, result.reason = "diverged", str(error)
         else:
@@ -179,21 +182,9 @@ class _Progress:
                 self._path.write_text(f"training {done}")
 
 
-def _end_with_parent() -> None:
-    """A benchmark that is killed takes its runs along: nobody would wait for them, and a resumed one starts anew."""
-    parent = os.getppid()
-
-    def watch() -> None:
-        while os.getppid() == parent:
-            time.sleep(0.5)
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 def main(path: Path) -> int:
     """Do what the request file asks; 0 where a result was reached, 1 where the run failed."""
-    _end_with_parent()
+    end_with_parent()
     request = Request.load(path)
     result = work(request)
     write(result, Workplace(Path(request.folder)).result(request.run.id))

@@ -250,7 +250,7 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's loss: photometric on what the photo shows, sparsity of the matte, the strategy's own terms."""
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        target = self.target(outputs, batch)
         shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
         if "mask" in batch:
             mask = self._downscale_if_required(batch["mask"].float()).to(self.device)
@@ -281,7 +281,7 @@ class SSASplatfactoModel(SplatfactoModel):
         """
         if self.training and self.step % self.metrics_every:
             return {}
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        target = self.target(outputs, batch)
         values = {"gaussian_count": self.num_points, **figures_of_step(outputs, target, self.artifacts)}
         self.camera_optimizer.get_metrics_dict(values)
         return values
@@ -294,5 +294,9 @@ class SSASplatfactoModel(SplatfactoModel):
         `composite_psnr` compares what the photo shows with the photo: the figure to read where test photos carry the
         artifact too.
         """
-        target = self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+        target = self.target(outputs, batch)
         return figures_of_view(outputs, target), pictures_of_view(outputs, target)
+
+    def target(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+        """The photo [H, W, 3] in [0, 1] that a render has to match: over its background where it is transparent."""
+        return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])

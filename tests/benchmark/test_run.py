@@ -31,12 +31,12 @@ def test_on_and_off_are_words_where_a_setting_has_words_and_truths_where_it_has_
 
 @pytest.fixture(scope="module")
 def along(tiny_scene, tmp_path_factory):
-    """A run that is evaluated along its way."""
+    """A run that is evaluated along its way, by several processes."""
     config = configure("ssa-splatfacto", tiny_scene, tmp_path_factory.mktemp("along"), 24, {**FULL, "overlay": "on"})
-    return train_and_evaluate(config, marks=(6, 12, 24))[0]
+    return train_and_evaluate(config, marks=(6, 12, 24), flip_processes=2)[0]
 
 
-def test_evaluating_along_the_way_changes_nothing_in_the_training(along, tiny_scene, tmp_path):
+def test_evaluating_along_the_way_and_in_processes_changes_nothing(along, tiny_scene, tmp_path):
     config = configure("ssa-splatfacto", tiny_scene, tmp_path, 24, {**FULL, "overlay": "on"})
     plain, _, _ = train_and_evaluate(config)
     assert plain.views == along.views

@@ -1,0 +1,58 @@
+"""FLIP in processes of its own: the same numbers, early refusals, and nobody left behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import psutil
+import pytest
+import torch
+
+from ssa_nerfstudio import metrics
+from ssa_nerfstudio.benchmark.flip_processes import FlipProcesses
+
+PROGRAM = """
+import time, torch
+from ssa_nerfstudio.benchmark.flip_processes import FlipProcesses
+
+if __name__ == "__main__":
+    flips = FlipProcesses(2)
+    image = torch.rand(16, 16, 3)
+    print(flips.submit(image, 1 - image).result() > 0, flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_views_get_their_own_number_in_whatever_order_they_end(processes):
+    views = torch.rand(5, 40, 30, 3, generator=torch.Generator().manual_seed(0))
+    flips = FlipProcesses(processes)
+    try:
+        waiting = [flips.submit(view, views[0]) for view in views]
+        assert [flip.result() for flip in waiting] == [metrics.flip(view, views[0]) for view in views]
+        with pytest.raises(ValueError, match="differ in shape"):
+            flips.submit(views[0], views[0][:20])
+    finally:
+        flips.close()
+    assert not multiprocessing.active_children()
+
+
+def test_processes_end_with_one_that_is_killed(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    parent = subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    assert parent.stdout.readline().strip() == "True"
+    children = psutil.Process(parent.pid).children(recursive=True)
+    assert children
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 10
+    while any(child.is_running() and child.status() != psutil.STATUS_ZOMBIE for child in children):
+        assert time.monotonic() < deadline, "processes go on without their parent"
+        time.sleep(0.1)
