@@ -1,4 +1,4 @@
-"""FLIP of many views at a time: it holds Python's lock for a quarter of a second, and a GPU is done long before."""
+"""FLIP of many views at a time: it holds Python's lock, scales badly with threads, and a GPU is done long before."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from multiprocessing import get_context
 from torch import Tensor
 
 from ssa_nerfstudio import metrics
-from ssa_nerfstudio.benchmark.parent import end_with_parent
+from ssa_nerfstudio.benchmark.parent import be_one_of_many
 from ssa_nerfstudio.flip_error import flip_error
 
 
@@ -20,7 +20,7 @@ class FlipProcesses:
         self._pool = None
         if processes > 1:
             # Started anew: a fork would take CUDA's state along.
-            self._pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=end_with_parent)
+            self._pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=be_one_of_many)
 
     def submit(self, render: Tensor, target: Tensor) -> Future[float]:
         """`metrics.flip` of a view, when it is done.

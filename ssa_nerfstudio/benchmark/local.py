@@ -19,8 +19,8 @@ from ssa_nerfstudio.benchmark.workplace import Workplace
 
 POLL = 0.2
 """Seconds between looks at the processes."""
-FLIP_PROCESSES = 8
-"""At most so many compare the views of one run."""
+FLIP_PROCESSES = 16
+"""At most so many compare the views of one run, on a core each."""
 PATIENCE = 10.0
 """Seconds that a process asked to end has before it is killed."""
 

@@ -17,3 +17,9 @@ def end_with_parent() -> None:
         os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def be_one_of_many() -> None:
+    """End with the parent, and work on one core: to be called before OpenMP is loaded, which reads it then."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    end_with_parent()
