@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import threading
 import time
@@ -20,6 +21,16 @@ def end_with_parent() -> None:
 
 
 def be_one_of_many() -> None:
-    """End with the parent, and work on one core: to be called before OpenMP is loaded, which reads it then."""
+    """In a process of `multiprocessing`: end with the parent, and work on one core.
+
+    To be called before OpenMP is loaded, which reads its number of threads then.
+    """
     os.environ["OMP_NUM_THREADS"] = "1"
-    end_with_parent()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()  # also where it has ended already
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -34,7 +35,8 @@ def source(data: str) -> Path:
     environment = {"SSA_DATA": "data", **os.environ}
     path = Path(os.path.expanduser(_expanded(data, environment)))
     if data != DEMO and not (path / "transforms.json").is_file():
-        hint = " (set SSA_DATA to the folder of captures)" if "$" in data else ""
+        variable = re.search(r"\$\{?(\w+)", data)
+        hint = f" (set {variable[1]} to the folder of captures)" if variable else ""
         raise refuse(
             f"{path}/transforms.json does not exist{hint}; put the capture there, or name other scenes with --scenes"
         )

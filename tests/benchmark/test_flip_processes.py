@@ -17,13 +17,14 @@ from ssa_nerfstudio import metrics
 from ssa_nerfstudio.benchmark.flip_processes import FlipProcesses
 
 PROGRAM = """
-import time, torch
+import sys, time, torch
 from ssa_nerfstudio.benchmark.flip_processes import FlipProcesses
 
 if __name__ == "__main__":
     flips = FlipProcesses(2)
     image = torch.rand(16, 16, 3)
-    print(flips.submit(image, 1 - image).result() > 0, flush=True)
+    flip = flips.submit(image, 1 - image)
+    print(flip.result() > 0 if sys.argv[1] == "at work" else True, flush=True)
     time.sleep(60)
 """
 
@@ -42,10 +43,11 @@ def test_views_get_their_own_number_in_whatever_order_they_end(processes):
     assert not multiprocessing.active_children()
 
 
-def test_processes_end_with_one_that_is_killed(tmp_path):
+@pytest.mark.parametrize("when", ["at work", "as they start"])
+def test_processes_end_with_one_that_is_killed(tmp_path, when):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    parent = subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE, text=True)
+    parent = subprocess.Popen([sys.executable, program, when], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     assert parent.stdout.readline().strip() == "True"
     children = psutil.Process(parent.pid).children(recursive=True)
