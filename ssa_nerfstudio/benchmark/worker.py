@@ -14,10 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ssa_nerfstudio.benchmark.parent import end_with_parent
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import Result, write
 from ssa_nerfstudio.benchmark.workplace import Workplace
+from ssa_nerfstudio.parent import end_with_parent
 
 if TYPE_CHECKING:
     from ssa_nerfstudio.plugin.pipeline import SSAPipeline

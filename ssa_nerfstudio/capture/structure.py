@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import sys
-import threading
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -16,6 +15,7 @@ import pycolmap
 
 from ssa_nerfstudio.capture.apart import JOB, MODEL, Pass, Report, Settings
 from ssa_nerfstudio.capture.pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
+from ssa_nerfstudio.parent import end_after
 
 _PAIRS_A_CALL = 64
 """Matched and stored together: what a kill can cost, and how often the progress bar moves."""
@@ -136,14 +136,10 @@ class Structure:
 def _main(folder: Path) -> None:
     """The child process of `apart.reconstruct`: reports as lines of JSON, and ends when its parent does."""
 
-    def end_with_parent() -> None:
-        sys.stdin.read()
-        os._exit(1)
-
     def report(*what: str | int) -> None:
         print(json.dumps(what), flush=True)
 
-    threading.Thread(target=end_with_parent, daemon=True).start()
+    end_after(sys.stdin.read)
     told = json.loads((folder / JOB).read_text(encoding="utf-8"))
     passes = [Pass(**each) for each in told["passes"]]
     structure = Structure(Path(told["images"]), passes, folder, Settings(**told["settings"]))

@@ -31,8 +31,6 @@ START_DISTANCE = NEAR_PLANE
 
 TOO_LARGE = 2.0**64
 """Gradients times this overflow in float32 where their squares do: its largest number is just below 2^128."""
-
-THE_LOSS = "the loss"
 LONELY_SIZE = 0.01
 """Size (world units) of start points that all lie in one place."""
 
@@ -173,12 +171,12 @@ class StepGuard:
         values = [name for name, p in parameters if not torch.isfinite(p).all()]
         if values:
             return f"{', '.join(values)} (the values themselves) and what follows from them were"
+        if still_there and self._loss is not None and not torch.isfinite(self._loss):
+            return "the loss was"  # and with it every gradient
         present = [name for name, p in parameters if p.grad is not None]
         broken = [name for name, p in parameters if p.grad is not None and not torch.isfinite(p.grad).all()]
-        if still_there and self._loss is not None and not torch.isfinite(self._loss):
-            return f"{THE_LOSS} was"  # and with it every gradient
         if not (broken and still_there):
-            return f"{THE_LOSS} or a gradient was"
+            return "the loss or a gradient was"
         if len(broken) > 1 and broken == present:
             return "every gradient was"
         return f"the gradient of {', '.join(broken)} was"

@@ -573,11 +573,12 @@ def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tm
 
 
 @OVERLAYS
-def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys, overlay):
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys, overlay, value):
     trainer = make(tiny_scene, tmp_path, steps=2, overlay=overlay)
     trainer.train()
     means = trainer.optimizers.optimizers["means"]
-    means.state[means.param_groups[0]["params"][0]]["exp_avg_sq"][0] = math.inf
+    means.state[means.param_groups[0]["params"][0]]["exp_avg_sq"][0] = value
     with pytest.raises(TrainingFailed):
         trainer.save_checkpoint(7)
     assert "means.state.0.exp_avg_sq" in capsys.readouterr().err

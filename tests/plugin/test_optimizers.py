@@ -35,7 +35,7 @@ def counts(optimizers: JointOptimizers) -> list[float]:
     return [float(v["step"]) for o in optimizers.optimizers.values() for v in o.state.values()]
 
 
-def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
+def test_steps_are_counted_where_they_are_taken_and_nowhere_else(capsys):
     """A rig: each camera's overlay has gradients at steps of its own; a skip belongs to the step it happened at."""
     guard = StepGuard(limit=100, magnified=False)
     optimizers, (a, b) = joint(guard)
@@ -47,6 +47,7 @@ def test_steps_are_counted_where_they_are_taken_and_nowhere_else():
         optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
     assert counts(optimizers) == [6, 6]
     optimizers.look(11)
+    assert "3 of the 12 steps up to 11 were skipped" in capsys.readouterr().err
     optimizers.zero_grad_some(["a", "b"])
     a.grad = torch.full((3,), math.nan)  # another window; b was first in the one before
     optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
