@@ -15,6 +15,7 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from torch import Tensor
 
 from ssa_nerfstudio.plugin.guards import bury_broken
+from ssa_nerfstudio.plugin.noise import perturb
 
 
 @dataclass
@@ -86,22 +87,12 @@ class AdaptiveDensityControl(DefaultStrategy):
         return super()._prune_gs(params, optimizers, state, step)
 
 
-class RateUnlessSkipped:
-    """A learning rate that is 0 at a skipped step. gsplat multiplies it by the noise's before it uses it: one kernel
-    for both."""
-
-    def __init__(self, rate: float, skipped: Tensor) -> None:
-        self._rate, self._skipped = rate, skipped
-
-    def __mul__(self, factor: float) -> Tensor:
-        """The product with a number, []."""
-        rate = self._rate * factor
-        return torch.rsub(self._skipped, rate, alpha=rate)
-
-
 @dataclass
 class MarkovChainMonteCarlo(MCMCStrategy):
-    """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians move to living ones, up to a fixed number."""
+    """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians move to living ones, up to a fixed number.
+
+    Its schedule stands here again because of the last line of a step: gsplat's noise is fifteen launches.
+    """
 
     absgrad: bool = False
     """MCMC reads no gradients of the centres; a field because the render call asks for it."""
@@ -122,10 +113,14 @@ class MarkovChainMonteCarlo(MCMCStrategy):
         packed: bool = False,
     ) -> None:
         """Relocate, add and perturb; the noise follows the current learning rate of the means."""
-        lr: Any = optimizers["means"].param_groups[0]["lr"]
-        if self.guarded and info.get("skipped") is not None:
-            lr = RateUnlessSkipped(lr, info["skipped"])
-        super().step_post_backward(params, optimizers, state, step, info, lr=lr)
+        due = step % self.refine_every == 0
+        if due and self.refine_start_iter < step < self.refine_stop_iter:
+            binoms = state["binoms"] = state["binoms"].to(params["means"].device)
+            self._relocate_gs(params, optimizers, binoms)
+            self._add_new_gs(params, optimizers, binoms)
+            torch.cuda.empty_cache()
+        lr = optimizers["means"].param_groups[0]["lr"]
+        perturb(params, lr * self.noise_lr, info.get("skipped") if self.guarded else None)
 
     @torch.no_grad()
     def _relocate_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], binoms: Tensor) -> int:

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
+from typing import Any
 
 import gsplat.strategy.ops as ops
 import numpy as np
 import pytest
 import torch
-from gsplat.strategy import DefaultStrategy
+from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
 from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.noise import perturb
 from ssa_nerfstudio.plugin.upstream import relocated
 
 WIDTH, HEIGHT = 40, 30
@@ -131,6 +136,81 @@ def test_mcmc_moves_the_dead_adds_up_to_its_cap_and_perturbs():
     assert not torch.equal(params["means"][20:60], before[20:])
     assert all(torch.isfinite(p).all() for p in params.values())
     assert all(optimizers[name].state[params[name]]["exp_avg"].shape == params[name].shape for name in params)
+
+
+def test_mcmc_relocates_adds_and_perturbs_as_gsplats_does():
+    results = []
+    for kind in (MarkovChainMonteCarlo, MCMCStrategy):
+        strategy = kind(refine_start_iter=0, refine_every=2, refine_stop_iter=6, cap_max=70)
+        params, optimizers = gaussians(60)
+        params["opacities"].data[:20] = -9.0
+        state = strategy.initialize_state()
+        torch.manual_seed(1)
+        options: Any = {} if kind is MarkovChainMonteCarlo else {"lr": 1e-3}
+        for step in range(8):
+            strategy.step_post_backward(params, optimizers, state, step, {}, **options)
+        results.append(params)
+    assert len(results[0]["means"]) > 60
+    assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+
+
+INTERPRETED = """
+import torch
+import ssa_nerfstudio.plugin.methods  # the CPU body that gsplat lacks
+from gsplat.strategy.ops import inject_noise_to_position
+from ssa_nerfstudio.plugin._noise_triton import move
+
+torch.manual_seed(0)
+for n in (1, 700):
+    params = {
+        "means": torch.randn(n, 3), "quats": torch.randn(n, 4),
+        "scales": torch.randn(n, 3) - 2, "opacities": 3 * torch.randn(n, 1) - 4,
+    }
+    params["quats"][0] = 0
+    expected = {name: p.clone() for name, p in params.items()}
+    torch.manual_seed(1)
+    inject_noise_to_position(expected, {}, {}, 5.0)
+    torch.manual_seed(1)
+    normals = torch.randn(n, 3)
+    rest = [params[name] for name in ("quats", "scales", "opacities")]
+    for skipped in (None, torch.zeros(())):
+        means = params["means"].clone()
+        move(means, *rest, normals, 5.0, skipped)
+        torch.testing.assert_close(means, expected["means"], rtol=1e-5, atol=1e-5)
+    means = params["means"].clone()
+    move(means, *rest, torch.full_like(normals, torch.nan), 5.0, torch.ones(()))
+    assert torch.equal(means, params["means"])
+print("equal")
+"""
+
+
+def test_tritons_noise_is_gsplats_in_its_interpreter():
+    """The kernel of a CUDA machine, on any."""
+    pytest.importorskip("triton")
+    process = subprocess.run(
+        [sys.executable, "-c", INTERPRETED],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert process.stdout.strip() == "equal", process.stderr
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("skipped", [None, 0.0, 1.0])
+def test_noise_on_a_gpu_is_gsplats(skipped):
+    params, _ = gaussians(5000)
+    params["opacities"].data -= 4
+    params["scales"].data += 2
+    params = {name: p.data.cuda() for name, p in params.items()}
+    expected = {name: p.clone() for name, p in params.items()}
+    if skipped != 1.0:
+        torch.manual_seed(1)
+        ops.inject_noise_to_position(expected, {}, {}, 5.0)  # pyright: ignore[reportArgumentType]
+    torch.manual_seed(1)
+    perturb(params, 5.0, None if skipped is None else torch.tensor(skipped, device="cuda"))
+    torch.testing.assert_close(params["means"], expected["means"], rtol=1e-5, atol=1e-5)
 
 
 def test_the_noise_follows_the_learning_rate_of_the_means():
