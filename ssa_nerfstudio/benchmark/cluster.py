@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from ssa_nerfstudio.benchmark.local import finish, start
+from ssa_nerfstudio.benchmark.local import Worker, finish
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import Result
 from ssa_nerfstudio.benchmark.worker import Request
@@ -90,6 +90,5 @@ def _task(request: Request) -> Result | None:
     """One run, in a process of its own on the worker's machine."""
     place = Workplace(Path(request.folder))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    process = start(request, visible.split(",")[0] if visible else None)
-    process.wait()
+    Worker(place, visible.split(",")[0] if visible else None).start(request).wait()
     return finish(place, request.run)

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from uuid import uuid4
 
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import NoResult, Result, read
@@ -56,6 +57,8 @@ class Local:
     """What repeats a run."""
     keep_models: bool = False
     processes: list[Process] = field(default_factory=list)
+    _ready: dict[str, Worker] = field(default_factory=dict)
+    """By CUDA device: a process that waits for the next run there."""
 
     def work(
         self,
@@ -94,7 +97,7 @@ class Local:
                     if deadline is not None and (estimate(run) or 0.0) > deadline - time.monotonic():
                         left.append(run)
                         continue
-                    self.processes.append(self._start(run, slots.pop(0)))
+                    self.processes.append(self._start(run, slots.pop(0), last=not waiting))
                 watch(self.processes, waiting)
                 if self.processes:
                     time.sleep(POLL)
@@ -114,8 +117,12 @@ class Local:
                 os.killpg(process.popen.pid, signal.SIGKILL)
                 process.popen.wait()
         self.processes.clear()
+        for worker in self._ready.values():
+            worker.dismiss()
+        self._ready.clear()
 
-    def _start(self, run: Run, device: str | None) -> Process:
+    def _start(self, run: Run, device: str | None, last: bool) -> Process:
+        """Starts a run; on a GPU with a process that has imported everything while the run before was at work."""
         request = Request(
             run,
             str(self.place.folder),
@@ -124,7 +131,10 @@ class Local:
             self.keep_models,
             self._flip_processes(),
         )
-        popen = start(request, device)
+        worker = self._ready.pop(device, None) if device is not None else None
+        popen = (worker or Worker(self.place, device)).start(request)
+        if device is not None and not last:
+            self._ready[device] = Worker(self.place, device)
         return Process(run, device, popen, time.monotonic(), self.place.running(run.id) / PROGRESS)
 
     def _flip_processes(self) -> int:
@@ -136,23 +146,48 @@ class Local:
         return finish(self.place, run)
 
 
-def start(request: Request, device: str | None) -> subprocess.Popen:
-    """Starts the process of one run, in a group of its own, with its log beside the results."""
-    place = Workplace(Path(request.folder))
-    running = place.running(request.run.id)
-    running.mkdir(parents=True, exist_ok=True)
-    place.log(request.run.id).parent.mkdir(parents=True, exist_ok=True)
-    request.store(running / "request.json")
-    environment = os.environ if device is None else {**os.environ, "CUDA_VISIBLE_DEVICES": device}
-    with place.log(request.run.id).open("w") as log:
-        return subprocess.Popen(
-            [sys.executable, "-m", "ssa_nerfstudio.benchmark.worker", str(running / "request.json")],
-            stdout=log,
-            stderr=subprocess.STDOUT,
-            stdin=subprocess.DEVNULL,
-            env=environment,
-            start_new_session=True,
-        )
+class Worker:
+    """A process that imports what training takes, touches no device, and waits for the run that it will do."""
+
+    def __init__(self, place: Workplace, device: str | None) -> None:
+        """Start it.
+
+        Args:
+            place: where it will work.
+            device: the only CUDA device that it will see; None: all of this process's.
+        """
+        self._place = place
+        place.unfinished.mkdir(parents=True, exist_ok=True)
+        self._log = place.unfinished / f"{uuid4().hex}.log"
+        with self._log.open("w") as output:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-m", "ssa_nerfstudio.benchmark.worker"],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                env=os.environ if device is None else {**os.environ, "CUDA_VISIBLE_DEVICES": device},
+                start_new_session=True,
+            )
+
+    def start(self, request: Request) -> subprocess.Popen:
+        """Have the run done, in a process group of its own, with its log beside the results."""
+        running, log = self._place.running(request.run.id), self._place.log(request.run.id)
+        running.mkdir(parents=True, exist_ok=True)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        self._log.rename(log)  # also where it is being written to
+        path = running / "request.json"
+        request.store(path)
+        assert self._popen.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # it was killed, and leaves no result
+            self._popen.stdin.write(str(path).encode())
+            self._popen.stdin.close()
+        return self._popen
+
+    def dismiss(self) -> None:
+        """End it; it has nothing to lose."""
+        self._popen.kill()
+        self._popen.communicate()
+        self._log.unlink()
 
 
 def finish(place: Workplace, run: Run) -> Result | None:

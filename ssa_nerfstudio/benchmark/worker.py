@@ -1,4 +1,7 @@
-"""The process of one run: `python -m ssa_nerfstudio.benchmark.worker REQUEST.json`, started by `ssa bench`."""
+"""The process of one run: `python -m ssa_nerfstudio.benchmark.worker`, started by `ssa bench`.
+
+Imports first, and then reads from standard input which request file to work on: meanwhile another run may be at work.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,8 @@ import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import psutil
 
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import Result, write
@@ -66,10 +71,14 @@ class Request:
         return cls(**{**values, "run": Run.load(values["run"])})
 
 
-def work(request: Request) -> Result:
-    """Train, evaluate, score the artifact, take pictures; whatever goes wrong becomes the result's status."""
-    import psutil
+def work(request: Request, imports: float) -> Result:
+    """Train, evaluate, score the artifact, take pictures; whatever goes wrong becomes the result's status.
 
+    Args:
+        request: what to do.
+        imports: seconds that this process has spent on imports.
+    """
+    began = time.monotonic()
     from ssa_nerfstudio.benchmark.machine import Company, revision
 
     company = Company()
@@ -85,7 +94,7 @@ def work(request: Request) -> Result:
         config = _configuration(run, place)
         result.schedules = _schedules(config)
         note.stage("photos")
-        imports = time.time() - psutil.Process().create_time()
+        imports += time.monotonic() - began
         try:
             outcome, pipeline, _ = training.train_and_evaluate(
                 config, note.step, run.marks, test_scale=1.0, flip_processes=request.flip_processes
@@ -182,14 +191,20 @@ class _Progress:
                 self._path.write_text(f"training {done}")
 
 
-def main(path: Path) -> int:
-    """Do what the request file asks; 0 where a result was reached, 1 where the run failed."""
+def main() -> int:
+    """Do what a request file asks; 0 where a result was reached or nothing asked, 1 where the run failed."""
     end_with_parent()
-    request = Request.load(path)
-    result = work(request)
+    with contextlib.suppress(Exception):  # where it is needed, and the run's result can say so, it fails again
+        import ssa_nerfstudio.benchmark.run  # noqa: F401
+    imports = time.time() - psutil.Process().create_time()
+    path = sys.stdin.read()
+    if not path:
+        return 0
+    request = Request.load(Path(path))
+    result = work(request, imports)
     write(result, Workplace(Path(request.folder)).result(request.run.id))
     return 1 if result.status == "failed" else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    sys.exit(main())

@@ -39,9 +39,14 @@ class Workplace:
         """What a run printed."""
         return self.folder / "logs" / f"{run}.log"
 
+    @property
+    def unfinished(self) -> Path:
+        """What interrupted runs leave here means nothing."""
+        return self.folder / "running"
+
     def running(self, run: str) -> Path:
-        """Where a run works until it has finished; what an interrupted one left there means nothing."""
-        return self.folder / "running" / run
+        """Where a run works until it has finished."""
+        return self.unfinished / run
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -51,5 +56,5 @@ class Workplace:
             BadInput: another process holds it, or it cannot be written.
         """
         with held(self.folder, "ssa bench"):
-            shutil.rmtree(self.folder / "running", ignore_errors=True)
+            shutil.rmtree(self.unfinished, ignore_errors=True)
             yield

@@ -15,6 +15,7 @@ import pytest
 from made_results import benchmark, folder_of, result
 
 from ssa_nerfstudio.benchmark.bench import Expectation, select
+from ssa_nerfstudio.benchmark.local import Local
 from ssa_nerfstudio.benchmark.plan import plan
 from ssa_nerfstudio.benchmark.results import read_all, write
 from ssa_nerfstudio.benchmark.specification import Part, SceneEntry, read_benchmark
@@ -157,13 +158,44 @@ def test_a_dask_cluster_runs_what_it_is_given(tmp_path):
     assert not list((tmp_path / "out" / "running").iterdir())
 
 
+def test_on_a_gpu_the_next_runs_process_is_ready_before_the_run_ends_and_gone_when_not_needed(tmp_path):
+    """Three runs that fail, for there is no dataset: where one works, another process must have been started."""
+    place = Workplace(tmp_path)
+    seen: list[int] = []
+    ready: list[bool] = []
+    results = []
+
+    def watch(processes, waiting):
+        for process in processes:
+            if process.popen.pid not in seen:
+                ready.append(process.popen.pid in children)
+                seen.append(process.popen.pid)
+        children.update(child.pid for child in psutil.Process().children())
+
+    def ended(run, result):
+        results.append((run.id, result.run.id, result.status))
+        if len(results) == 2:
+            raise KeyboardInterrupt
+
+    children: set[int] = set()
+    runs = plan(benchmark())[:3]
+    before = set(psutil.Process().children())
+    with pytest.raises(KeyboardInterrupt):
+        Local(place, ["0"], 1, lambda run: "the command").work(runs, lambda run: None, None, watch, ended)
+    assert ready == [False, True]
+    assert results == [(run.id, run.id, "failed") for run in runs[:2]]
+    assert all(run.dataset in place.log(run.id).read_text() for run in runs[:2])
+    assert set(psutil.Process().children()) == before
+    assert list(place.unfinished.iterdir()) == []
+
+
 def test_a_run_that_fails_says_why(tmp_path):
     part = Part(methods=("misspelt",), steps=5)
     made = benchmark(scenes=(SceneEntry("demo"),), parts=(part,), candidates={"misspelt": {"sparsness": "log"}})
     (run,) = plan(made)
     place = Workplace(tmp_path)
     place.running(run.id).mkdir(parents=True)
-    failed = work(Request(run, str(tmp_path), 1, "the command"))
+    failed = work(Request(run, str(tmp_path), 1, "the command"), imports=0.0)
     assert (failed.status, failed.command) == ("failed", "the command")
     assert "the model has no setting 'sparsness'" in failed.reason
     write(failed, place.result(run.id))
