@@ -10,7 +10,7 @@ from pathlib import Path
 from ssa_nerfstudio.benchmark import tables
 from ssa_nerfstudio.benchmark.document import Document, Picture, Section, Table
 from ssa_nerfstudio.benchmark.plan import Run
-from ssa_nerfstudio.benchmark.results import Result, read_all
+from ssa_nerfstudio.benchmark.results import Result, absence, read_all
 from ssa_nerfstudio.benchmark.sheets import sheet
 from ssa_nerfstudio.benchmark.specification import Benchmark
 from ssa_nerfstudio.benchmark.study import CLEAN, Study, studies
@@ -71,21 +71,13 @@ def _plans(folders: list[Path]) -> tuple[set[str], set[str]]:
     return runs, protocols
 
 
-def _absent(missing: set[str], planned: set[str]) -> str:
-    if not planned:
-        return "what was planned is not noted beside the results, so that missing ones are not known"
-    named = f": {', '.join(f'`{run}`' for run in sorted(missing))}" if missing else ""
-    return f"{len(missing)} of {len(planned)} planned ones are missing{named}"
-
-
 def _overview(results: list[Result], planned: set[str], problems: list[str], folders: list[Path]) -> Section:
     results = [result for result in results if not result.run.marks]
     counts = Counter(result.status for result in results)
-    missing = planned - {result.run.id for result in results}
     text = [
         f"Made by `ssa report {' '.join(shlex.quote(str(folder)) for folder in folders)}` from {len(results)} runs: "
         f"{counts['finished']} finished, {counts['diverged']} diverged (†, left out of means), {counts['failed']} "
-        f"failed; {_absent(missing, planned)}. Every run's JSON holds its command.",
+        f"failed; {absence(results, planned)}. Every run's JSON holds its command.",
         "PSNR, SSIM (valid padding), FLIP and mean colour deviation (0 to 255) compare the *clean* render with "
         "clean test views that no training saw.",
     ]

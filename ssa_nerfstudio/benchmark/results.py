@@ -125,6 +125,20 @@ def read_all(folders: list[Path]) -> tuple[list[Result], list[str]]:
     return list(found.values()), problems
 
 
+def absence(results: list[Result], planned: set[str]) -> str:
+    """A clause for a report: how many of the planned runs have no result, and which.
+
+    Args:
+        results: what there is.
+        planned: ids; empty where that is not known.
+    """
+    if not planned:
+        return "what was planned is not noted beside the results, so that missing ones are not known"
+    missing = planned - {result.run.id for result in results}
+    named = f": {', '.join(f'`{run}`' for run in sorted(missing))}" if missing else ""
+    return f"{len(missing)} of {len(planned)} planned ones are missing{named}"
+
+
 def merge(source: Path, target: Path) -> int:
     """Copies the results that another folder has and this one has not, with their pictures and logs.
 

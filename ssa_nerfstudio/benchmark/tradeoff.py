@@ -11,7 +11,7 @@ from typing import Any
 
 from ssa_nerfstudio.benchmark.document import Document, Picture, Section, Table
 from ssa_nerfstudio.benchmark.frontier import Point, frontier, knee, price
-from ssa_nerfstudio.benchmark.results import Result, read_all
+from ssa_nerfstudio.benchmark.results import Result, absence, read_all
 from ssa_nerfstudio.benchmark.tradeoff_figure import draw
 from ssa_nerfstudio.errors import refuse
 
@@ -87,12 +87,13 @@ class Subject:
         )
 
 
-def analyse(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
+def analyse(folders: list[Path], output: Path, planned: set[str]) -> tuple[list[Path], list[str]]:
     """Writes tradeoff.md and .html, tradeoff.csv, and a figure for every subject as PNG and SVG.
 
     Args:
         folders: of `ssa tradeoff`.
         output: folder of the report.
+        planned: ids of the runs that it should be made from, so that it can name those that are missing.
 
     Returns:
         The files, and lines about what was left out: files that are no results, runs that did not finish, and, from
@@ -120,9 +121,9 @@ def analyse(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
         "How to read this",
         [
             f"Made by `ssa tradeoff NAME --report-only --output {source}` from {len(along)} runs, {len(shared)} of "
-            "which shared their device: those are drawn, but on no frontier. Seconds are the overlay's statistics and "
-            "training; decoding photos and evaluations along the way are not counted. Quality is that of the clean "
-            "render on clean test views at full resolution.",
+            f"which shared their device: those are drawn, but on no frontier; {absence(results, planned)}. Seconds "
+            "are the overlay's statistics and training; decoding photos and evaluations along the way are not counted. "
+            "Quality is that of the clean render on clean test views at full resolution.",
             "A point on the frontier is beaten by no other in both time and PSNR. The knee is the point farthest above "
             "the line between the frontier's ends, over the logarithm of seconds. Learning rates fall over the whole "
             "length of a run: a point early in a long run is worse than the end of a short one.",

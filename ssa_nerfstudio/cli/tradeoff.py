@@ -30,14 +30,17 @@ class Command(BenchCommand):
         benchmark = read_benchmark(self.benchmark)
         if benchmark.tradeoff is None:
             raise refuse(f"{self.benchmark} states no tradeoff; add the key 'tradeoff' or name another benchmark")
+        planned = plan_tradeoff(benchmark)
         if not self.report_only:
-            update(self, "tradeoff", benchmark, plan_tradeoff(benchmark))
+            update(self, "tradeoff", benchmark, planned)
         if self.prepare_only or self.list:
             return
+        from ssa_nerfstudio.benchmark.bench import select
         from ssa_nerfstudio.benchmark.tradeoff import analyse
 
+        chosen = {run.id for run in select(planned, self.scenes, self.only)}
         console = Console(highlight=False, soft_wrap=True)
-        files, problems = analyse([self.output, *self.merge], self.output / "tradeoff")
+        files, problems = analyse([self.output, *self.merge], self.output / "tradeoff", chosen)
         for problem in problems:
             console.print(f"left out: {problem}", style="yellow")
         for file in files:
