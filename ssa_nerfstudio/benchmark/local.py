@@ -15,7 +15,7 @@ from uuid import uuid4
 
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import NoResult, Result, read
-from ssa_nerfstudio.benchmark.worker import PROGRESS, Request
+from ssa_nerfstudio.benchmark.worker import PROGRESS, REQUEST, Request
 from ssa_nerfstudio.benchmark.workplace import Workplace
 
 POLL = 0.2
@@ -161,7 +161,7 @@ class Worker:
         self._log = place.unfinished / f"{uuid4().hex}.log"
         with self._log.open("w") as output:
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", "ssa_nerfstudio.benchmark.worker"],
+                [sys.executable, "-m", "ssa_nerfstudio.benchmark.worker", str(place.folder)],
                 stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
@@ -175,11 +175,10 @@ class Worker:
         running.mkdir(parents=True, exist_ok=True)
         log.parent.mkdir(parents=True, exist_ok=True)
         self._log.rename(log)  # also where it is being written to
-        path = running / "request.json"
-        request.store(path)
+        request.store(running / REQUEST)
         assert self._popen.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it was killed, and leaves no result
-            self._popen.stdin.write(str(path).encode())
+            self._popen.stdin.write(request.run.id.encode())
             self._popen.stdin.close()
         return self._popen
 

@@ -1,6 +1,6 @@
-"""The process of one run: `python -m ssa_nerfstudio.benchmark.worker`, started by `ssa bench`.
+"""The process of one run: `python -m ssa_nerfstudio.benchmark.worker FOLDER`, started by `ssa bench`.
 
-Imports first, and then reads from standard input which request file to work on: meanwhile another run may be at work.
+Imports first, and then reads from standard input which run to do: meanwhile another may be at work.
 """
 
 from __future__ import annotations
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 PROGRESS = "progress"
 """File in a run's folder: what it does, and how many steps are done, in one line."""
+REQUEST = "request.json"
+"""File in a run's folder: what is asked for."""
 OVERLAY_SETTINGS = ("overlay", "sparsity", "ignore_background")
 """Settings of the model whose names begin so are the overlay's."""
 _SCHEDULED = (
@@ -191,20 +193,19 @@ class _Progress:
                 self._path.write_text(f"training {done}")
 
 
-def main() -> int:
-    """Do what a request file asks; 0 where a result was reached or nothing asked, 1 where the run failed."""
+def main(place: Workplace) -> int:
+    """Do the run that is asked for; 0 where a result was reached or nothing asked, 1 where the run failed."""
     end_with_parent()
     with contextlib.suppress(Exception):  # where it is needed, and the run's result can say so, it fails again
         import ssa_nerfstudio.benchmark.run  # noqa: F401
     imports = time.time() - psutil.Process().create_time()
-    path = sys.stdin.read()
-    if not path:
+    run = sys.stdin.read()
+    if not run:
         return 0
-    request = Request.load(Path(path))
-    result = work(request, imports)
-    write(result, Workplace(Path(request.folder)).result(request.run.id))
+    result = work(Request.load(place.running(run) / REQUEST), imports)
+    write(result, place.result(run))
     return 1 if result.status == "failed" else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(Workplace(Path(sys.argv[1]))))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
+import os
 import shutil
 import subprocess
 import sys
@@ -19,7 +20,7 @@ from ssa_nerfstudio.benchmark.local import Local
 from ssa_nerfstudio.benchmark.plan import plan
 from ssa_nerfstudio.benchmark.results import read_all, write
 from ssa_nerfstudio.benchmark.specification import Part, SceneEntry, read_benchmark
-from ssa_nerfstudio.benchmark.worker import Request, work
+from ssa_nerfstudio.benchmark.worker import REQUEST, Request, work
 from ssa_nerfstudio.benchmark.workplace import Workplace
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import BadInput
@@ -86,6 +87,15 @@ def test_what_runs_at_the_time_limit_is_stopped_and_leaves_nothing(tmp_path):
     workers = [p for p in psutil.process_iter(["cmdline"]) if any(str(tmp_path) in a for a in p.info["cmdline"] or ())]
     assert workers == []
     assert ssa("bench", "smoke", "--output", tmp_path, "--list").stdout.count("to do") == 5
+
+
+def test_a_run_that_failed_is_done_again(tmp_path, capsys):
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    (run,) = plan(read_benchmark(str(path)))
+    folder = folder_of(tmp_path / "out", [result(run, status="failed", reason="the machine caught fire")])
+    main(["bench", str(path), "--output", str(folder)])
+    assert [each.status for each in read_all([folder])[0]] == ["finished"]
 
 
 def test_results_of_other_folders_are_taken_over(tmp_path, capsys):
@@ -170,6 +180,8 @@ def test_on_a_gpu_the_next_runs_process_is_ready_before_the_run_ends_and_gone_wh
             if process.popen.pid not in seen:
                 ready.append(process.popen.pid in children)
                 seen.append(process.popen.pid)
+                request = Request.load(place.running(process.run.id) / REQUEST)
+                assert request.flip_processes == min(16, os.cpu_count() or 1)
         children.update(child.pid for child in psutil.Process().children())
 
     def ended(run, result):
