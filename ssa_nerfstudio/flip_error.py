@@ -2,23 +2,7 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-
 import numpy as np
-
-from ssa_nerfstudio.parent import end_after
-
-
-def be_one_of_many() -> None:
-    """In a process of `multiprocessing`: work on one core, and end with the parent, also where that has ended already.
-
-    To be called before OpenMP is loaded, which reads its number of threads then.
-    """
-    os.environ["OMP_NUM_THREADS"] = "1"
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    end_after(parent.join)
 
 
 def flip_error(reference: np.ndarray, test: np.ndarray) -> float:

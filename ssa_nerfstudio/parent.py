@@ -1,14 +1,15 @@
-"""Processes that end with the one that started them: nobody would wait for what a killed command has begun."""
+"""Processes that end with the one that started them: nobody would wait for what a killed command has begun.
+
+Imports nothing that starts threads, so that `be_one_of_many` comes before all that does.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import select
 import threading
-import time
 from collections.abc import Callable
-
-POLL = 0.5
-"""Seconds between looks at who the parent is."""
 
 
 def end_after(wait: Callable[[], object]) -> None:
@@ -22,11 +23,19 @@ def end_after(wait: Callable[[], object]) -> None:
 
 
 def end_with_parent() -> None:
-    """Watch the parent from now on, for processes that share nothing else with it."""
-    parent = os.getppid()
+    """For processes whose standard input is a pipe that the parent holds open: end when nobody does any more, also
+    where the parent has ended already. What was written into the pipe stays there to be read."""
+    hangup = select.poll()
+    hangup.register(0, 0)
+    end_after(hangup.poll)
 
-    def wait() -> None:
-        while os.getppid() == parent:
-            time.sleep(POLL)
 
-    end_after(wait)
+def be_one_of_many() -> None:
+    """In a process of `multiprocessing`: work on one core, and end with the parent, also where that has ended already.
+
+    To be called before OpenMP and BLAS are loaded, which read their number of threads then.
+    """
+    os.environ["OMP_NUM_THREADS"] = "1"
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    end_after(parent.join)

@@ -8,7 +8,8 @@ from multiprocessing import get_context
 from torch import Tensor
 
 from ssa_nerfstudio import metrics
-from ssa_nerfstudio.flip_error import be_one_of_many, flip_error
+from ssa_nerfstudio.flip_error import flip_error
+from ssa_nerfstudio.parent import be_one_of_many
 
 
 class FlipProcesses:

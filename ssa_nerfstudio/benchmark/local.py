@@ -86,6 +86,7 @@ class Local:
             while waiting or self.processes:
                 for process in [p for p in self.processes if p.popen.poll() is not None]:
                     self.processes.remove(process)
+                    process.popen.communicate()  # closes the pipe
                     slots.append(process.device)
                     ended(process.run, self._result(process.run))
                 if deadline is not None and time.monotonic() > deadline:
@@ -97,7 +98,10 @@ class Local:
                     if deadline is not None and (estimate(run) or 0.0) > deadline - time.monotonic():
                         left.append(run)
                         continue
-                    self.processes.append(self._start(run, slots.pop(0), last=not waiting))
+                    device = slots.pop(0)
+                    self.processes.append(self._start(run, device))
+                    if waiting:
+                        self._make_ready(device)
                 watch(self.processes, waiting)
                 if self.processes:
                     time.sleep(POLL)
@@ -115,13 +119,13 @@ class Local:
                 process.popen.wait(PATIENCE)
             except subprocess.TimeoutExpired:
                 os.killpg(process.popen.pid, signal.SIGKILL)
-                process.popen.wait()
+            process.popen.communicate()
         self.processes.clear()
         for worker in self._ready.values():
             worker.dismiss()
         self._ready.clear()
 
-    def _start(self, run: Run, device: str | None, last: bool) -> Process:
+    def _start(self, run: Run, device: str | None) -> Process:
         """Starts a run; on a GPU with a process that has imported everything while the run before was at work."""
         request = Request(
             run,
@@ -132,10 +136,17 @@ class Local:
             self._flip_processes(),
         )
         worker = self._ready.pop(device, None) if device is not None else None
+        if worker is not None and not worker.waits():  # it was killed
+            worker.dismiss()
+            worker = None
         popen = (worker or Worker(self.place, device)).start(request)
-        if device is not None and not last:
-            self._ready[device] = Worker(self.place, device)
         return Process(run, device, popen, time.monotonic(), self.place.running(run.id) / PROGRESS)
+
+    def _make_ready(self, device: str | None) -> None:
+        """Has a process wait for the next run on a GPU; on the CPU it would take a core from the run."""
+        if device is not None and device not in self._ready:
+            with contextlib.suppress(OSError):  # then the next run begins with its imports
+                self._ready[device] = Worker(self.place, device)
 
     def _flip_processes(self) -> int:
         """What the cores allow; 1 without a GPU, where a view takes longer to render than to compare."""
@@ -169,24 +180,32 @@ class Worker:
                 start_new_session=True,
             )
 
+    def waits(self) -> bool:
+        """Whether it is still there."""
+        return self._popen.poll() is None
+
     def start(self, request: Request) -> subprocess.Popen:
-        """Have the run done, in a process group of its own, with its log beside the results."""
+        """Have the run done, in a process group of its own, with its log beside the results.
+
+        It ends early where the process's standard input is closed.
+        """
         running, log = self._place.running(request.run.id), self._place.log(request.run.id)
         running.mkdir(parents=True, exist_ok=True)
         log.parent.mkdir(parents=True, exist_ok=True)
-        self._log.rename(log)  # also where it is being written to
+        with contextlib.suppress(FileNotFoundError):  # somebody cleared the folder
+            self._log.rename(log)  # also where it is being written to
         request.store(running / REQUEST)
         assert self._popen.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it was killed, and leaves no result
-            self._popen.stdin.write(request.run.id.encode())
-            self._popen.stdin.close()
+            self._popen.stdin.write(f"{request.run.id}\n".encode())
+            self._popen.stdin.flush()
         return self._popen
 
     def dismiss(self) -> None:
         """End it; it has nothing to lose."""
         self._popen.kill()
         self._popen.communicate()
-        self._log.unlink()
+        self._log.unlink(missing_ok=True)
 
 
 def finish(place: Workplace, run: Run) -> Result | None:

@@ -37,7 +37,7 @@ class Result:
     curve: list[dict[str, float]] = field(default_factory=list)
     """Metrics along the run: step, seconds, gaussians, metrics."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """startup, statistics, training, evaluation; startup counts from the process's first moment."""
+    """startup, statistics, training, evaluation; startup counts from when the run was asked for."""
     alone: bool = False
     """Whether the run had its device to itself."""
     company: dict[str, float] = field(default_factory=dict)
@@ -60,7 +60,7 @@ class Result:
 
     @property
     def total_seconds(self) -> float:
-        """From the process's first moment to its last."""
+        """From when the run was asked for to its end."""
         return sum(self.seconds.values())
 
 

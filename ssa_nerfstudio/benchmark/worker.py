@@ -13,11 +13,9 @@ import shutil
 import sys
 import time
 import traceback
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import psutil
 
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import Result, write
@@ -61,6 +59,8 @@ class Request:
     """Keep nerfstudio's folder with config.yml and checkpoint in `models/`."""
     flip_processes: int = 1
     """Processes that compare views by FLIP."""
+    asked: float = field(default_factory=time.time)
+    """When, in seconds since the epoch: what is waited for before the first step begins here."""
 
     def store(self, path: Path) -> None:
         """Write for the process to read."""
@@ -73,21 +73,20 @@ class Request:
         return cls(**{**values, "run": Run.load(values["run"])})
 
 
-def work(request: Request, imports: float) -> Result:
+def work(request: Request, revision: str) -> Result:
     """Train, evaluate, score the artifact, take pictures; whatever goes wrong becomes the result's status.
 
     Args:
         request: what to do.
-        imports: seconds that this process has spent on imports.
+        revision: of the code that does it.
     """
-    began = time.monotonic()
-    from ssa_nerfstudio.benchmark.machine import Company, revision
+    from ssa_nerfstudio.benchmark.machine import Company
 
     company = Company()
     run, place = request.run, Workplace(Path(request.folder))
     note = _Progress(place.running(run.id) / PROGRESS)
     note.stage("loading")
-    result = Result(run, "failed", command=request.command, revision=revision())
+    result = Result(run, "failed", command=request.command, revision=revision)
     try:
         from ssa_nerfstudio.benchmark import run as training
         from ssa_nerfstudio.benchmark.machine import versions
@@ -96,7 +95,7 @@ def work(request: Request, imports: float) -> Result:
         config = _configuration(run, place)
         result.schedules = _schedules(config)
         note.stage("photos")
-        imports += time.monotonic() - began
+        waited = time.time() - request.asked
         try:
             outcome, pipeline, _ = training.train_and_evaluate(
                 config, note.step, run.marks, test_scale=1.0, flip_processes=request.flip_processes
@@ -105,7 +104,7 @@ def work(request: Request, imports: float) -> Result:
             result.status, result.reason = "diverged", str(error)
         else:
             result.metrics, result.views, result.curve = outcome.metrics, outcome.views, outcome.curve
-            result.seconds = {**outcome.seconds, "startup": imports + outcome.seconds["startup"]}
+            result.seconds = {**outcome.seconds, "startup": waited + outcome.seconds["startup"]}
             result.gaussians, result.peak_memory_mb = outcome.gaussians, outcome.peak_memory_mb
             note.stage("pictures")
             result.artifact = _artifact(run, pipeline, place)
@@ -198,11 +197,13 @@ def main(place: Workplace) -> int:
     end_with_parent()
     with contextlib.suppress(Exception):  # where it is needed, and the run's result can say so, it fails again
         import ssa_nerfstudio.benchmark.run  # noqa: F401
-    imports = time.time() - psutil.Process().create_time()
-    run = sys.stdin.read()
+    from ssa_nerfstudio.benchmark.machine import revision
+
+    imported = revision()
+    run = sys.stdin.readline().strip()
     if not run:
         return 0
-    result = work(Request.load(place.running(run) / REQUEST), imports)
+    result = work(Request.load(place.running(run) / REQUEST), imported)
     write(result, place.result(run))
     return 1 if result.status == "failed" else 0
 

@@ -15,7 +15,7 @@ import pycolmap
 
 from ssa_nerfstudio.capture.apart import JOB, MODEL, Pass, Report, Settings
 from ssa_nerfstudio.capture.pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
-from ssa_nerfstudio.parent import end_after
+from ssa_nerfstudio.parent import end_with_parent
 
 _PAIRS_A_CALL = 64
 """Matched and stored together: what a kill can cost, and how often the progress bar moves."""
@@ -139,7 +139,7 @@ def _main(folder: Path) -> None:
     def report(*what: str | int) -> None:
         print(json.dumps(what), flush=True)
 
-    end_after(sys.stdin.read)
+    end_with_parent()
     told = json.loads((folder / JOB).read_text(encoding="utf-8"))
     passes = [Pass(**each) for each in told["passes"]]
     structure = Structure(Path(told["images"]), passes, folder, Settings(**told["settings"]))

@@ -65,7 +65,7 @@ class Command:
 
 
 def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]) -> int:
-    """What bench and tradeoff share: brings the folder up to date with the runs; how many are left."""
+    """What bench and tradeoff share: brings the folder up to date with the runs; how many are left, or failed."""
     from rich.console import Console
 
     from ssa_nerfstudio.benchmark import bench
@@ -102,4 +102,10 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         left = bench.bench(runs, place, f"ssa {name} {command.benchmark}", options, console)
     if left:
         console.print(f"{len(left)} of {len(runs)} runs are left; call the same again to go on. First: {left[0].id}")
-    return len(left)
+    done = {result.run.id for result in read_all([command.output])[0] if result.status != "failed"}
+    failed = [run for run in runs if run not in left and run.id not in done]
+    if failed:
+        console.print(
+            f"{len(failed)} of {len(runs)} runs failed; call the same again to repeat them. First: {failed[0].id}"
+        )
+    return len(left) + len(failed)

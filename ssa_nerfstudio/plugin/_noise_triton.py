@@ -28,7 +28,7 @@ def move(
     )  # fmt: skip
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["n", "skipped"])  # which change: no version of the kernel for each kind of them
 def _move(
     means, quats, scales, opacities, normals, skipped, rate, n, GUARDED: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip

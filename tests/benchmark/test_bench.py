@@ -168,37 +168,63 @@ def test_a_dask_cluster_runs_what_it_is_given(tmp_path):
     assert not list((tmp_path / "out" / "running").iterdir())
 
 
-def test_on_a_gpu_the_next_runs_process_is_ready_before_the_run_ends_and_gone_when_not_needed(tmp_path):
-    """Three runs that fail, for there is no dataset: where one works, another process must have been started."""
+def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tmp_path):
+    """Runs that fail, for there is no dataset. A process that was killed while it waited is replaced."""
     place = Workplace(tmp_path)
-    seen: list[int] = []
-    ready: list[bool] = []
+    this = psutil.Process()
+    before = set(this.children())
+    ready: dict[int, bool] = {}
+    waited: set[int] = set()
     results = []
 
     def watch(processes, waiting):
+        working = {process.popen.pid for process in processes}
         for process in processes:
-            if process.popen.pid not in seen:
-                ready.append(process.popen.pid in children)
-                seen.append(process.popen.pid)
+            if process.popen.pid not in ready:
+                ready[process.popen.pid] = process.popen.pid in waited
                 request = Request.load(place.running(process.run.id) / REQUEST)
-                assert request.flip_processes == min(16, os.cpu_count() or 1)
-        children.update(child.pid for child in psutil.Process().children())
+                assert request.flip_processes == min(16, max(1, (os.cpu_count() or 1) // 2))
+                assert psutil.Process(process.popen.pid).environ()["CUDA_VISIBLE_DEVICES"] == process.device
+        others = {child for child in this.children() if child not in before and child.pid not in working}
+        waited.update(child.pid for child in others)
+        assert len(others) <= (2 if waiting else 1)
+        if len(results) == 2 and len(waiting) == 1:
+            for child in others:
+                child.kill()
 
     def ended(run, result):
         results.append((run.id, result.run.id, result.status))
-        if len(results) == 2:
-            raise KeyboardInterrupt
 
-    children: set[int] = set()
-    runs = plan(benchmark())[:3]
-    before = set(psutil.Process().children())
-    with pytest.raises(KeyboardInterrupt):
-        Local(place, ["0"], 1, lambda run: "the command").work(runs, lambda run: None, None, watch, ended)
-    assert ready == [False, True]
-    assert results == [(run.id, run.id, "failed") for run in runs[:2]]
-    assert all(run.dataset in place.log(run.id).read_text() for run in runs[:2])
-    assert set(psutil.Process().children()) == before
+    runs = plan(benchmark())[:5]
+    local = Local(place, ["4", "7"], 1, lambda run: "the command")
+    assert local.work(runs, lambda run: None, None, watch, ended) == []
+    assert sorted(results) == sorted((run.id, run.id, "failed") for run in runs)
+    assert all(run.dataset in place.log(run.id).read_text() for run in runs)
+    assert list(ready.values())[:4] == [False, False, True, True]
+    assert set(this.children()) == before
     assert list(place.unfinished.iterdir()) == []
+
+
+def test_what_waits_for_a_run_ends_with_the_benchmark(tmp_path):
+    def ended(run, result):
+        raise KeyboardInterrupt
+
+    before = set(psutil.Process().children())
+    local = Local(Workplace(tmp_path), ["0"], 1, lambda run: "the command")
+    with pytest.raises(KeyboardInterrupt):
+        local.work(plan(benchmark())[:2], lambda run: None, None, lambda *_: None, ended)
+    assert set(psutil.Process().children()) == before
+    assert list(Workplace(tmp_path).unfinished.iterdir()) == []
+
+
+def test_imports_are_done_while_the_run_before_is_at_work(tmp_path, monkeypatch):
+    """CUDA_VISIBLE_DEVICES is how `ssa bench` learns of a GPU; that there is none is nothing to it."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    path = tmp_path / "two.yaml"
+    path.write_text(SHORT.replace("3dgs", "3dgs, overlay-on"))
+    assert ssa("bench", path, "--output", tmp_path / "out").returncode == 0
+    first, second = (each.seconds["startup"] for each in sorted(read_all([tmp_path / "out"])[0], key=lambda r: r.ended))
+    assert second < 0.7 * first
 
 
 def test_a_run_that_fails_says_why(tmp_path):
@@ -207,7 +233,7 @@ def test_a_run_that_fails_says_why(tmp_path):
     (run,) = plan(made)
     place = Workplace(tmp_path)
     place.running(run.id).mkdir(parents=True)
-    failed = work(Request(run, str(tmp_path), 1, "the command"), imports=0.0)
+    failed = work(Request(run, str(tmp_path), 1, "the command"), revision="abc")
     assert (failed.status, failed.command) == ("failed", "the command")
     assert "the model has no setting 'sparsness'" in failed.reason
     write(failed, place.result(run.id))

@@ -8,13 +8,18 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
+import numpy as np
 import psutil
 import pytest
 import torch
 
 from ssa_nerfstudio import metrics
 from ssa_nerfstudio.benchmark.flip_processes import FlipProcesses
+from ssa_nerfstudio.flip_error import flip_error
+from ssa_nerfstudio.parent import be_one_of_many
 
 PROGRAM = """
 import sys, time, torch
@@ -41,6 +46,24 @@ def test_views_get_their_own_number_in_whatever_order_they_end(processes):
     finally:
         flips.close()
     assert not multiprocessing.active_children()
+
+
+def test_each_works_on_one_core(monkeypatch):
+    """numpy's BLAS and OpenMP read how many there are when they are loaded."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    with ProcessPoolExecutor(1, get_context("spawn"), be_one_of_many) as pool:
+        pools = pool.submit(threads).result()
+    assert pools
+    assert set(pools.values()) == {1}
+
+
+def threads() -> dict[str, int]:
+    """Of every pool that there is once FLIP is loaded."""
+    from threadpoolctl import threadpool_info
+
+    flip_error(np.zeros((8, 8, 3), np.float32), np.ones((8, 8, 3), np.float32))
+    return {pool["filepath"]: pool["num_threads"] for pool in threadpool_info()}
 
 
 @pytest.mark.parametrize("when", ["at work", "as they start"])

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import psutil
 import pytest
 from PIL import Image
 
@@ -25,6 +26,11 @@ def ssa(*arguments: str | Path) -> str:
     done = subprocess.run([*SSA, *arguments], capture_output=True, text=True, timeout=DEADLINE, env=ENVIRONMENT)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
+
+
+def at_work(folder: Path) -> list[psutil.Process]:
+    """Processes that have a folder on their command line."""
+    return [p for p in psutil.process_iter(["cmdline"]) if str(folder) in (p.info["cmdline"] or ())]
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +48,13 @@ def killed(tmp_path_factory) -> tuple[Path, dict[Path, bytes]]:
         assert process.poll() is None, "the benchmark ended before it could be killed"
         assert time.monotonic() < deadline, "no run ended"
         time.sleep(0.1)
+    assert len(at_work(folder)) > 1
     process.send_signal(signal.SIGKILL)
     process.wait()
-    time.sleep(2)  # its runs notice and end
+    deadline = time.monotonic() + 5
+    while at_work(folder):
+        assert time.monotonic() < deadline, "its runs go on"
+        time.sleep(0.1)
     return folder, {path: path.read_bytes() for path in folder.glob("results/*.json")}
 
 

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.process_data.colmap_utils import colmap_to_json
@@ -105,8 +106,10 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path):
     next(line for line in running.stdout if line.startswith("features"))
     with pytest.raises(BadInput, match="another ssa process is at work"):
         process("--train", tmp_path / "photos", "--output", tmp_path / "out")
+    (child,) = psutil.Process(running.pid).children()
     running.kill()
     running.wait()
+    child.wait(5)
     assert not (tmp_path / "out").exists()
     assert list(tmp_path.glob(".out.work/motion/database.db"))
     done = subprocess.run(command, capture_output=True, text=True, check=True)

@@ -240,9 +240,18 @@ def _(folder: Path) -> None:
     assert all(torch.isfinite(p).all() for p in pipeline.model.parameters())
 
 
-@TRAINING.case("MCMC that starts below its smallest opacity", "Everything is dead at the first relocation.")
-def _(folder: Path) -> None:
-    train(dataset(folder / "scene"), 40, "ssa-splatfacto-mcmc", mcmc_opacity_start=0.002, warmup_length=1)
+for _overlay in ("on", "off"):
+
+    @TRAINING.case(
+        f"MCMC that starts below its smallest opacity, overlay {_overlay}",
+        "Everything is dead at the first relocation.",
+        _overlay,
+    )
+    def _(overlay: str, folder: Path) -> None:
+        train(
+            dataset(folder / "scene"), 40, "ssa-splatfacto-mcmc", overlay=overlay, mcmc_opacity_start=0.002,
+            warmup_length=1,
+        )  # fmt: skip
 
 
 for _guards in (True, False):
