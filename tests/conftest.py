@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
@@ -54,3 +55,16 @@ def edit_transforms(scene: Path, **changes) -> None:
     """Replace entries of a scene's transforms.json."""
     path = scene / "transforms.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def check_in_tritons_interpreter(program: str) -> None:
+    """Run a program in which Triton's kernels, those of a CUDA machine, run anywhere; it says "equal" at its end."""
+    pytest.importorskip("triton")
+    process = subprocess.run(
+        [sys.executable, "-c", program],
+        env={**os.environ, "TRITON_INTERPRET": "1"},
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert process.stdout.strip() == "equal", process.stderr

@@ -18,9 +18,9 @@ from made_results import benchmark, folder_of, result
 from ssa_nerfstudio.benchmark.bench import Expectation, select
 from ssa_nerfstudio.benchmark.local import Local
 from ssa_nerfstudio.benchmark.plan import plan
-from ssa_nerfstudio.benchmark.results import read_all, write
-from ssa_nerfstudio.benchmark.specification import Part, SceneEntry, read_benchmark
-from ssa_nerfstudio.benchmark.worker import REQUEST, Request, work
+from ssa_nerfstudio.benchmark.results import read_all
+from ssa_nerfstudio.benchmark.specification import read_benchmark
+from ssa_nerfstudio.benchmark.worker import REQUEST, Request
 from ssa_nerfstudio.benchmark.workplace import Workplace
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import BadInput
@@ -227,17 +227,22 @@ def test_imports_are_done_while_the_run_before_is_at_work(tmp_path, monkeypatch)
     assert second < 0.7 * first
 
 
-def test_a_run_that_fails_says_why(tmp_path):
-    part = Part(methods=("misspelt",), steps=5)
-    made = benchmark(scenes=(SceneEntry("demo"),), parts=(part,), candidates={"misspelt": {"sparsness": "log"}})
-    (run,) = plan(made)
-    place = Workplace(tmp_path)
-    place.running(run.id).mkdir(parents=True)
-    failed = work(Request(run, str(tmp_path), 1, "the command"), revision="abc")
-    assert (failed.status, failed.command) == ("failed", "the command")
+def test_a_run_that_fails_says_why(tmp_path, capsys):
+    path = tmp_path / "misspelt.yaml"
+    path.write_text(
+        "scenes: [{data: demo}]\ncandidates: {misspelt: {sparsness: log}}\n"
+        "parts: [{methods: [misspelt], effects: [none], steps: 5}]"
+    )
+    (run,) = plan(read_benchmark(str(path)))
+    main(["bench", str(path), "--output", str(tmp_path / "out")])
+    said = capsys.readouterr().out
+    assert f"1 of 1 runs failed; call the same again to repeat them. First: {run.id}" in said
+    assert "are done" not in said
+    (failed,), _ = read_all([tmp_path / "out"])
+    assert failed.status == "failed"
+    assert failed.command == f"ssa bench {path} --output {tmp_path / 'out'} --only {run.id}"
     assert "the model has no setting 'sparsness'" in failed.reason
-    write(failed, place.result(run.id))
-    assert Expectation(read_all([tmp_path])[0]).seconds(run) is None
+    assert Expectation([failed]).seconds(run) is None
 
 
 @pytest.mark.parametrize(

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 
 import pytest
 import torch
+from conftest import check_in_tritons_interpreter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pytorch_msssim import ssim as msssim_ssim
@@ -305,13 +303,4 @@ print("equal")
 
 
 def test_tritons_kernels_are_the_formula_in_its_interpreter() -> None:
-    """The kernels of a CUDA machine, on any."""
-    pytest.importorskip("triton")
-    process = subprocess.run(
-        [sys.executable, "-c", INTERPRETED],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert process.stdout.strip() == "equal", process.stderr
+    check_in_tritons_interpreter(INTERPRETED)

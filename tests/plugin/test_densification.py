@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 from typing import Any
 
 import gsplat.strategy.ops as ops
 import numpy as np
 import pytest
 import torch
+from conftest import check_in_tritons_interpreter
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -185,16 +183,7 @@ print("equal")
 
 
 def test_tritons_noise_is_gsplats_in_its_interpreter():
-    """The kernel of a CUDA machine, on any."""
-    pytest.importorskip("triton")
-    process = subprocess.run(
-        [sys.executable, "-c", INTERPRETED],
-        env={**os.environ, "TRITON_INTERPRET": "1"},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert process.stdout.strip() == "equal", process.stderr
+    check_in_tritons_interpreter(INTERPRETED)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
