@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 import torch
 
@@ -68,3 +69,8 @@ def check_in_tritons_interpreter(program: str) -> None:
         timeout=300,
     )
     assert process.stdout.strip() == "equal", process.stderr
+
+
+def at_work(folder: Path) -> list[psutil.Process]:
+    """Processes that have a folder on their command line."""
+    return [p for p in psutil.process_iter(["cmdline"]) if any(str(folder) in a for a in p.info["cmdline"] or ())]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
 
@@ -90,7 +90,6 @@ def _task(request: Request) -> Result | None:
     """One run, in a process of its own on the worker's machine."""
     place = Workplace(Path(request.folder))
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
-    request = replace(request, asked=time.time())  # it may have waited for this worker
     with Worker(place, visible.split(",")[0] if visible else None).start(request) as process:
         process.wait()
     return finish(place, request.run)

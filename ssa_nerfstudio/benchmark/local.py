@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from uuid import uuid4
 
@@ -194,7 +194,7 @@ class Worker:
         log.parent.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(FileNotFoundError):  # somebody cleared the folder
             self._log.rename(log)  # also where it is being written to
-        request.store(running / REQUEST)
+        replace(request, asked=time.time()).store(running / REQUEST)
         assert self._popen.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it was killed, and leaves no result
             self._popen.stdin.write(f"{request.run.id}\n".encode())

@@ -13,7 +13,7 @@ import shutil
 import sys
 import time
 import traceback
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -59,8 +59,8 @@ class Request:
     """Keep nerfstudio's folder with config.yml and checkpoint in `models/`."""
     flip_processes: int = 1
     """Processes that compare views by FLIP."""
-    asked: float = field(default_factory=time.time)
-    """When, in seconds since the epoch: what is waited for before the first step begins here."""
+    asked: float = 0.0
+    """When the process was asked, in seconds since the epoch: what is waited for before the first step begins here."""
 
     def store(self, path: Path) -> None:
         """Write for the process to read."""

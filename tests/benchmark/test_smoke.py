@@ -11,8 +11,8 @@ import sys
 import time
 from pathlib import Path
 
-import psutil
 import pytest
+from conftest import at_work
 from PIL import Image
 
 from ssa_nerfstudio.benchmark.results import read_all
@@ -26,11 +26,6 @@ def ssa(*arguments: str | Path) -> str:
     done = subprocess.run([*SSA, *arguments], capture_output=True, text=True, timeout=DEADLINE, env=ENVIRONMENT)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout
-
-
-def at_work(folder: Path) -> list[psutil.Process]:
-    """Processes that have a folder on their command line."""
-    return [p for p in psutil.process_iter(["cmdline"]) if str(folder) in (p.info["cmdline"] or ())]
 
 
 @pytest.fixture(scope="module")
