@@ -58,6 +58,10 @@ class Run:
         """
         return cls(**{**values, "marks": tuple(values["marks"])})
 
+    def value(self, knob: str) -> Any:
+        """What it sets a tradeoff's knob to, varied or not; None: whatever the method's default is."""
+        return getattr(self, knob) if knob in RUN_KNOBS else self.model.get(knob)
+
     @property
     def id(self) -> str:
         """A name for people and files; equal for equal runs, on every machine."""

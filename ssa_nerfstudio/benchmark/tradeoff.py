@@ -49,6 +49,10 @@ class Curve:
         """Names of what it varies."""
         return tuple(self.result.run.variation)
 
+    def value(self, knob: str) -> str:
+        """What it sets a knob to, whether it varies it or not."""
+        return _shown(self.result.run.value(knob))
+
     @property
     def points(self) -> list[dict[str, Any]]:
         """Its points with a finite PSNR and more than no seconds, by step."""
@@ -74,6 +78,22 @@ class Subject:
     def alone(self) -> list[Curve]:
         """Those whose seconds count."""
         return [curve for curve in self.curves if curve.result.alone]
+
+    @property
+    def knobs(self) -> list[str]:
+        """What is varied by itself."""
+        return sorted({curve.knobs[0] for curve in self.curves if len(curve.knobs) == 1})
+
+    @property
+    def base(self) -> Curve | None:
+        """The run that all others vary."""
+        return next((curve for curve in self.curves if not curve.knobs), None)
+
+    @property
+    def around(self) -> str:
+        """What the base sets every knob to; nothing where it is missing."""
+        base = self.base
+        return "" if base is None else "Base: " + ", ".join(f"{knob} {base.value(knob)}" for knob in self.knobs)
 
     def front(self, metric: str = "psnr") -> list[Point]:
         """The frontier over all points of the curves that had the device to themselves."""
@@ -154,7 +174,7 @@ def _order(curve: Curve) -> tuple:
 def _section(subject: Subject, figure: Path) -> Section:
     front = subject.front()
     bend = knee(front)
-    text = [f"On {subject.device}."]
+    text = [f"On {subject.device}. {subject.around}".rstrip()]
     if not subject.alone:
         text.append("**Every run shared its device: seconds mean little, and there is no frontier.**")
     if bend is not None:
@@ -180,7 +200,7 @@ def _section(subject: Subject, figure: Path) -> Section:
 
 def _knob_table(subject: Subject) -> Table:
     """The end of every run against the base's end."""
-    base = next((c for c in subject.curves if c.setting == BASE), None)
+    base = subject.base
     reference = base.points[-1] if base is not None and base.points else None
     rows = []
     for curve in subject.curves:
@@ -255,4 +275,6 @@ def _write_csv(subjects: list[Subject], path: Path) -> Path:
 
 
 def _shown(value: Any) -> str:
+    if value is None:
+        return "default"
     return value if isinstance(value, str) else json.dumps(value)

@@ -22,16 +22,28 @@ if TYPE_CHECKING:
 COLUMNS = 3
 """Panels of knobs in a row."""
 TOGETHER = "several together"
+KNOBS = {
+    "steps": "length of the training",
+    "image_scale": "size of the training photos",
+    "overlay_downscale": "overlay smaller by",
+    "densification": "how Gaussians multiply",
+    "cap_max": "number of Gaussians",
+    "sparsity": "what keeps the matte sparse",
+    "ssim_lambda": "weight of the SSIM term",
+    "ssim": "how SSIM is computed",
+    "rasterizer": "what draws the splats",
+}
+"""For people who do not know the options by their names."""
 COLOURS = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
-    *("#7f7f00", "#8c564b", "#17becf", "#4d4d4d", "#8a2be2", "#bcbd22"),
+    *("#7f7f00", "#8c564b", "#4d4d4d", "#8a2be2", "#bcbd22", "#17becf"),
 )
 """Okabe and Ito's, which most colour-blind people tell apart, and some more."""
 
 
 def draw(subject: Subject, folder: Path) -> list[Path]:
     """Writes NAME.png and NAME.svg; the two files, PNG first."""
-    knobs = sorted({curve.knobs[0] for curve in subject.curves if len(curve.knobs) == 1})
+    knobs = subject.knobs
     together = any(len(curve.knobs) > 1 for curve in subject.curves)
     rows = math.ceil(len(knobs) / COLUMNS)
     figure = plt.figure(figsize=(11, 5 + 2.9 * (rows + together)), layout="constrained")
@@ -68,12 +80,12 @@ def _overview(axes: Axes, subject: Subject) -> None:
         axes.annotate(
             f"knee: {bend.quality:.2f} dB after {_seconds(bend.seconds)}\n{curve.setting}, step {entry['step']:.0f}",
             (bend.seconds, bend.quality),
-            xytext=(14, -16),
-            textcoords="offset points",
-            verticalalignment="top",
+            # Curves rise from the lower left: below them, at the right, nothing is hidden.
+            xytext=(0.985, 0.28),
+            textcoords="axes fraction",
+            horizontalalignment="right",
             color="#a04000",
-            bbox={"boxstyle": "round", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
-            arrowprops={"arrowstyle": "-", "color": "#d55e00"},
+            arrowprops={"arrowstyle": "-", "color": "#d55e00", "relpos": (0, 0.5)},
         )
     axes.plot([], [], color="0.75", marker=".", label="every run, from first to last evaluation")
     if len(subject.alone) < len(subject.curves):
@@ -83,8 +95,9 @@ def _overview(axes: Axes, subject: Subject) -> None:
     axes.xaxis.set_major_locator(LogLocator(10, (1, 3)))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _seconds(value)))
     axes.xaxis.set_minor_formatter(NullFormatter())
-    axes.set_title(f"What accuracy costs: {subject.scene} behind {subject.effect}, on {subject.device}")
-    axes.set_xlabel("seconds of statistics and training (logarithmic)")
+    axes.set_title(f"What accuracy costs: {subject.scene} behind {subject.effect}, on {subject.device}", pad=20)
+    axes.text(0.5, 1.015, subject.around, transform=axes.transAxes, fontsize=9, horizontalalignment="center")
+    axes.set_xlabel("time of statistics and training (logarithmic)")
     axes.set_ylabel("PSNR of clean test views, dB")
     axes.legend(loc="lower right", frameon=False)
     axes.grid(alpha=0.25)
@@ -99,11 +112,11 @@ def _panel(axes: Axes, subject: Subject, name: str) -> None:
         _line(axes, curve, color="0.88", linewidth=1)
     labelled: dict[str, str] = {}
     for curve in chosen:
-        label = curve.setting.removeprefix(f"{name} ")
+        label = curve.setting if name == TOGETHER else curve.value(name) + ("" if curve.knobs else " (base)")
         fresh = label not in labelled
         colour = labelled.setdefault(label, COLOURS[len(labelled) % len(COLOURS)])
         _line(axes, curve, color=colour, marker="o", markersize=3, label=textwrap.fill(label, 44) if fresh else None)
-    axes.set_title(name, fontsize=10)
+    axes.set_title(f"{KNOBS[name]} ({name})" if name in KNOBS else name, fontsize=10)
     # Long names must not squeeze the panels.
     axes.legend(fontsize=7, frameon=False, loc="lower right").set_in_layout(False)
     axes.tick_params(labelsize=8)
@@ -117,4 +130,4 @@ def _line(axes: Axes, curve: Curve, **style) -> None:
 
 
 def _seconds(value: float) -> str:
-    return f"{value / 60:.3g} min" if value >= 120 else f"{value:.3g} s"
+    return f"{value / 60:.3g} min" if value >= 600 else f"{value:.3g} s"

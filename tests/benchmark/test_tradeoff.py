@@ -106,6 +106,7 @@ def test_gpu_and_cpu_are_never_on_one_frontier(tmp_path):
 def test_prices_and_knobs_are_those_of_the_curves(tmp_path):
     analyse([folder_of(tmp_path, curves())], tmp_path / "out", IDS)
     text = (tmp_path / "out" / "tradeoff.md").read_text()
+    assert "Base: overlay_downscale default, steps 7000" in text
     # overlay_downscale 2 ends 1 dB below the base and 2 s earlier: 2 s for each dB.
     assert "| overlay_downscale 2 | 24.00 | 0.700 | 0.200 | 6.0 | 100 | -1.00 | -2.0 | 2.0 |" in text
 
