@@ -59,8 +59,9 @@ class Request:
     """Keep nerfstudio's folder with config.yml and checkpoint in `models/`."""
     flip_processes: int = 1
     """Processes that compare views by FLIP."""
-    asked: float = 0.0
-    """When the process was asked, in seconds since the epoch: what is waited for before the first step begins here."""
+    asked: float | None = None
+    """When the process was asked, in seconds since the epoch: what is waited for before the first step begins here.
+    None: as it starts work."""
 
     def store(self, path: Path) -> None:
         """Write for the process to read."""
@@ -95,7 +96,7 @@ def work(request: Request, revision: str) -> Result:
         config = _configuration(run, place)
         result.schedules = _schedules(config)
         note.stage("photos")
-        waited = time.time() - request.asked
+        waited = 0.0 if request.asked is None else time.time() - request.asked
         try:
             outcome, pipeline, _ = training.train_and_evaluate(
                 config, note.step, run.marks, test_scale=1.0, flip_processes=request.flip_processes
