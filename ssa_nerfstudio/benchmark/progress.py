@@ -15,9 +15,6 @@ from ssa_nerfstudio.benchmark.local import Process
 from ssa_nerfstudio.benchmark.plan import Run
 from ssa_nerfstudio.benchmark.results import Result
 
-LAST_SHOWN = 8
-"""Ended runs that stay in the table."""
-
 
 class ProgressTable:
     """A table that is redrawn in a terminal; elsewhere a line for every run that ends."""
