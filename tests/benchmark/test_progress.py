@@ -6,7 +6,7 @@ import dataclasses
 import io
 import time
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import pytest
 from made_results import benchmark, result
@@ -14,6 +14,7 @@ from rich.console import Console
 
 from ssa_nerfstudio.benchmark.plan import Run, plan
 from ssa_nerfstudio.benchmark.progress import ProgressTable
+from ssa_nerfstudio.benchmark.results import Result
 
 RUNS = plan(benchmark())[:4]
 
@@ -30,20 +31,20 @@ class Working:
         return "training", 50
 
 
-def drawn(terminal: bool, ended: list, working: int, waiting: int) -> str:
-    """What is printed while so many of four runs work and wait; the first was done before."""
-    console = Console(file=io.StringIO(), force_terminal=terminal, width=200)
-    processes: Any = [Working(run, "3", time.monotonic() - 61) for run in RUNS[2 : 2 + working]]
-    with ProgressTable(console, len(RUNS), 1, 1) as table:
+def drawn(terminal: bool, ended: list[tuple[Run, Result | None]]) -> str:
+    """What is printed of four runs: the first was done before, the third works, the last waits."""
+    stream = io.StringIO()
+    process: Any = Working(RUNS[2], "3", time.monotonic() - 61)
+    with ProgressTable(Console(file=stream, force_terminal=terminal, width=200), len(RUNS), 1, 1) as table:
         for run, outcome in ended:
             table.ended(run, outcome)
-        table.watch(processes, RUNS[4 - waiting :] if waiting else [])
-    return cast(io.StringIO, console.file).getvalue()
+        table.watch([process], RUNS[3:])
+    return stream.getvalue()
 
 
 def test_a_terminal_shows_what_runs_how_far_and_when_all_will_be_over():
     outcome = dataclasses.replace(result(RUNS[1]), seconds={"startup": 20.0, "training": 100.0})
-    text = drawn(True, [(RUNS[1], outcome)], 1, 1)
+    text = drawn(True, [(RUNS[1], outcome)])
     assert f"[2/4] {RUNS[1].id}: PSNR" in text
     row = next(line for line in text.splitlines() if RUNS[2].id in line)
     assert all(word in row for word in ("GPU 3", "training", f"50 / {RUNS[2].steps}"))
@@ -54,14 +55,14 @@ def test_a_terminal_shows_what_runs_how_far_and_when_all_will_be_over():
 @pytest.mark.parametrize("status", ["failed", "diverged"])
 def test_trouble_is_counted_and_said(status):
     outcome = dataclasses.replace(result(RUNS[1]), status=status, reason="the disk is full")
-    text = drawn(True, [(RUNS[1], outcome)], 1, 1)
+    text = drawn(True, [(RUNS[1], outcome)])
     assert f"{RUNS[1].id}: {status}: the disk is full" in text
     assert f"1 waiting; 1 {status}" in text
     assert "min left" not in text
 
 
 def test_a_log_file_gets_a_line_for_every_run_that_ends_and_nothing_else():
-    text = drawn(False, [(RUNS[1], result(RUNS[1])), (RUNS[2], None)], 1, 0)
+    text = drawn(False, [(RUNS[1], result(RUNS[1])), (RUNS[2], None)])
     first, second = text.splitlines()
     assert first.startswith(f"[2/4] {RUNS[1].id}: PSNR")
     assert second == f"[3/4] {RUNS[2].id}: its process ended without a result; see its log"
