@@ -23,7 +23,7 @@ $(READY): pyproject.toml Makefile
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "error: $(PYTHON) cannot make environments; install its venv package (Debian: apt install python3-venv)" >&2; exit 2; }
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[dev]'
-	$(BIN)/python -m ssa_nerfstudio.plugin.open3d_libraries
+	$(BIN)/python -m ssa_nerfstudio.plugin.compat.open3d_libraries
 	@touch $@
 
 demo: $(READY)
@@ -36,7 +36,7 @@ test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 stability: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "stability or not stability" tests/stability tests/plugin/test_guards.py tests/plugin/test_checkpoints.py
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m "stability or not stability" tests/stability tests/plugin/training/test_nonfinite.py tests/plugin/training/test_checkpoints.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -12,7 +12,7 @@ import docstring_parser
 from ssa_nerfstudio.cli import COMMANDS
 
 OWN = {
-    "Model": ("ssa_nerfstudio.plugin.settings", "SSASplatfactoModelConfig", "--pipeline.model."),
+    "Model": ("ssa_nerfstudio.plugin.settings", "ModelSettings", "--pipeline.model."),
     "Photos": ("ssa_nerfstudio.plugin.datamanager", "SSADatamanagerConfig", "--pipeline.datamanager."),
     "Training": ("ssa_nerfstudio.plugin.trainer", "SSATrainerConfig", "--"),
 }

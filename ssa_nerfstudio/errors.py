@@ -1,53 +1,30 @@
-"""How the software refuses: one line that names the culprit and the remedy.
-
-Exit code 2: the input cannot be worked with. Exit code 3: the input was fine, and the training could not go on.
-"""
+"""Exceptions of the library. They carry what is wrong and what to do about it; the command line prints them."""
 
 from __future__ import annotations
 
-import sys
 
+class SSAError(Exception):
+    """Base class: a problem and its remedy, each one sentence fragment without a final period."""
 
-class BadInput(SystemExit):
-    """Input that cannot be worked with: a `SystemExit` of code 2, which ends `ns-*` commands without a traceback."""
+    def __init__(self, problem: str, remedy: str = "") -> None:
+        """Store both parts.
 
-    def __init__(self, message: str) -> None:
-        """Take the whole message: what is wrong with what, and what to do about it, in one line."""
-        super().__init__(2)
-        self.message = message
-
-    def __str__(self) -> str:
-        return self.message
-
-
-def refuse(message: str) -> BadInput:
-    """Print the message as one line on the error stream and return the exception to raise: `raise refuse(...)`."""
-    return BadInput(_print(message))
-
-
-class TrainingFailed(SystemExit):
-    """A training that cannot go on though its input was fine: a `SystemExit` of code 3."""
-
-    def __init__(self, message: str) -> None:
-        """Take the whole message: what happened at which step, and what to do about it, in one line."""
-        super().__init__(3)
-        self.message = message
+        Args:
+            problem: what is wrong with which file, value or step.
+            remedy: what the user can do about it; empty where the problem says it.
+        """
+        super().__init__(problem, remedy)
+        self.problem = problem
+        self.remedy = remedy
 
     def __str__(self) -> str:
-        return self.message
+        """Problem and remedy in one line."""
+        return " ".join("; ".join(part for part in (self.problem, self.remedy) if part).split())
 
 
-def give_up(message: str) -> TrainingFailed:
-    """Print the message as one line on the error stream and return the exception to raise: `raise give_up(...)`."""
-    return TrainingFailed(_print(message))
+class InputError(SSAError, ValueError):
+    """An input that cannot be used: a file, an argument, a dataset, a checkpoint. Exit code 2 of a command."""
 
 
-def warn(message: str) -> None:
-    """Print the message as one line on the error stream, and go on."""
-    _print(message, "warning")
-
-
-def _print(message: str, kind: str = "error") -> str:
-    message = " ".join(message.split())
-    print(f"ssa-nerfstudio: {kind}: {message}", file=sys.stderr, flush=True)
-    return message
+class TrainingError(SSAError, RuntimeError):
+    """A training with valid input that cannot continue. Exit code 3 of a command."""

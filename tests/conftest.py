@@ -14,8 +14,8 @@ import psutil
 import pytest
 import torch
 
-from ssa_nerfstudio.demo.scene import DemoScene
-from ssa_nerfstudio.effects.dashboard import Dashboard
+from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
+from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 torch.set_num_threads(1)
 

@@ -6,6 +6,9 @@ import importlib
 import sys
 import warnings
 
+from ssa_nerfstudio._system import terminal_messages
+from ssa_nerfstudio.errors import InputError, SSAError
+
 COMMANDS = {
     "bench": "Train and score a matrix of scenes, artifacts, methods and seeds; resumable.",
     "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
@@ -18,8 +21,6 @@ COMMANDS = {
     "tradeoff": "What accuracy costs in time: one knob at a time and a few together, with frontier and knee.",
 }
 """Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""
-INTERRUPTED = 130
-"""Exit code after ctrl+c: what shells give a command that the signal ended."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -38,19 +39,24 @@ def main(arguments: list[str] | None = None) -> None:
 
         print(__version__)
         return
-    if name not in COMMANDS:
-        from ssa_nerfstudio.errors import refuse
-
-        raise refuse(f"there is no command {name!r}; choose one of {', '.join(COMMANDS)} (ssa --help)")
-    from ssa_nerfstudio.cli import arguments as options
-
-    warnings.simplefilter("ignore", FutureWarning)  # libraries' own, at import: nothing that a user could act on
+    terminal_messages.show_warnings()
+    warnings.simplefilter("ignore", FutureWarning)  # raised by libraries at import; no user can act on them
     try:
-        command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
-        options.read(command, rest, f"ssa {name}", COMMANDS[name]).run()
-    except KeyboardInterrupt:
-        print(f"ssa {name} was stopped", file=sys.stderr)
-        raise SystemExit(INTERRUPTED) from None
+        _run(name, rest)
+    except SSAError as error:
+        raise SystemExit(terminal_messages.print_error(error)) from None
+    except KeyboardInterrupt as interrupt:
+        print(str(interrupt) or f"ssa {name} was stopped", file=sys.stderr)
+        raise SystemExit(terminal_messages.INTERRUPTED_EXIT_CODE) from None
+
+
+def _run(name: str, options: list[str]) -> None:
+    if name not in COMMANDS:
+        raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")
+    from ssa_nerfstudio.cli import arguments
+
+    command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+    arguments.read(command, options, f"ssa {name}", COMMANDS[name]).run()
 
 
 def _usage() -> str:

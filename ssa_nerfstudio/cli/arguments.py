@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 T = TypeVar("T")
 
@@ -35,7 +35,7 @@ def read(command: type[T], arguments: list[str], program: str, description: str)
         description: what --help says first.
 
     Raises:
-        BadInput: an option is unknown, missing, or has a value that it does not take.
+        InputError: an option is unknown, missing, or has a value that it does not take.
         SystemExit: of code 0, after --help.
     """
     try:
@@ -44,7 +44,7 @@ def read(command: type[T], arguments: list[str], program: str, description: str)
     except SystemExit as end:
         if not end.code:
             raise
-    raise refuse(f"{_explain(_options(command), arguments)} ({program} --help)")
+    raise InputError(f"{_explain(_options(command), arguments)} ({program} --help)")
 
 
 @dataclasses.dataclass(frozen=True)

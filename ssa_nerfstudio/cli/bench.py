@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
-    from ssa_nerfstudio.benchmark.plan import Run
-    from ssa_nerfstudio.benchmark.specification import Benchmark
+    from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark
+    from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 
 
 @dataclass
@@ -50,15 +50,17 @@ class Command:
         """Bring the folder up to date.
 
         Raises:
-            BadInput: the arguments, the benchmark or a capture cannot be worked with.
+            InputError: the arguments, the benchmark or a capture cannot be worked with.
         """
-        from ssa_nerfstudio.benchmark.plan import plan
-        from ssa_nerfstudio.benchmark.specification import read_benchmark
+        from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
+        from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
 
         benchmark = read_benchmark(self.benchmark)
         runs = plan(benchmark)
         if not runs:
-            raise refuse(f"{self.benchmark} states no parts; `ssa tradeoff {self.benchmark}` may be what you want")
+            raise InputError(
+                f"{self.benchmark} states no parts", f"`ssa tradeoff {self.benchmark}` may be what you want"
+            )
         left = update(self, "bench", benchmark, runs)
         if left == 0 and not (self.prepare_only or self.list):
             print(f"All {self.benchmark} runs that were asked for are done: ssa report {self.output}")
@@ -68,16 +70,16 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
     """What bench and tradeoff share: brings the folder up to date with the runs; how many are left, or failed."""
     from rich.console import Console
 
-    from ssa_nerfstudio.benchmark import bench
-    from ssa_nerfstudio.benchmark.report import store_plan
-    from ssa_nerfstudio.benchmark.results import merge, read_all
-    from ssa_nerfstudio.benchmark.scenes import prepare
+    from ssa_nerfstudio.experiments.benchmark.execution import execute as bench
+    from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
+    from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import store_plan
+    from ssa_nerfstudio.experiments.benchmark.results import merge, read_all
 
     for option in ("runs_per_device", "threads"):
         if getattr(command, option) < 1:
-            raise refuse(f"--{option.replace('_', '-')} must be at least 1, got {getattr(command, option)}")
+            raise InputError(f"--{option.replace('_', '-')} must be at least 1, got {getattr(command, option)}")
     if command.time_limit is not None and command.time_limit <= 0:
-        raise refuse(f"--time-limit must be a positive number of minutes, got {command.time_limit:g}")
+        raise InputError(f"--time-limit must be a positive number of minutes, got {command.time_limit:g}")
     runs = bench.select(planned, command.scenes, command.only)
     place = bench.reach(command.output)
     console = Console(highlight=False, soft_wrap=True)
@@ -89,7 +91,7 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
     with place.held():
         for folder in command.merge:
             if not (folder / "results").is_dir():
-                raise refuse(f"--merge {folder} holds no results; name the --output folder of another ssa bench")
+                raise InputError(f"--merge {folder} holds no results", "name the --output folder of another ssa bench")
             console.print(f"{merge(folder, command.output)} results taken over from {folder}")
         store_plan(command.output, name, benchmark, planned)
         if command.prepare_only:

@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -27,14 +27,15 @@ class Command:
     def run(self) -> None:
         """Train, print the tables, write the report."""
         if self.steps < 1 or not 0 < self.scale_factor <= 1:
-            raise refuse("--steps must be at least 1 and --scale-factor in (0, 1]")
+            raise InputError("--steps must be at least 1 and --scale-factor in (0, 1]")
         if self.data is not None:
-            from ssa_nerfstudio.plugin.inputs import check_transforms
+            from ssa_nerfstudio.plugin.validation import check_transforms
 
             check_transforms(self.data)
         console = Console()
         console.print("Loading nerfstudio ...")
-        from ssa_nerfstudio.demo import report, run
+        from ssa_nerfstudio.experiments.demo import comparison as run
+        from ssa_nerfstudio.experiments.demo import demo_report as report
 
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console) as progress:

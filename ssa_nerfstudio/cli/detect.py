@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -31,25 +31,25 @@ class Command:
         """Detect, say what was found, and write what was asked for.
 
         Raises:
-            BadInput: the arguments or photos cannot be worked with.
+            InputError: the arguments or photos cannot be worked with.
         """
         import shutil
 
         from rich.console import Console
 
-        from ssa_nerfstudio.capture.detect import as_json, cameras_of, detect_camera, write_detections
-        from ssa_nerfstudio.overlay.detection import LEAST_VIEWS
-        from ssa_nerfstudio.simulation.staging import staged_folder
+        from ssa_nerfstudio.data.writing import staged_folder
+        from ssa_nerfstudio.evidence.capture_detection import as_json, cameras_of, detect_camera, write_detections
+        from ssa_nerfstudio.evidence.detection import LEAST_VIEWS
 
         for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
             if (value := getattr(self, name)) < lowest:
-                raise refuse(f"--{name} must be at least {lowest}, got {value}")
+                raise InputError(f"--{name} must be at least {lowest}, got {value}")
         if self.json is not None and not self.json.parent.is_dir():
-            raise refuse(f"--json {self.json}: there is no folder {self.json.parent}; make it first")
+            raise InputError(f"--json {self.json}: there is no folder {self.json.parent}", "make it first")
         if self.json is not None and self.json.is_dir():
-            raise refuse(f"--json {self.json} is a folder; name a file")
+            raise InputError(f"--json {self.json} is a folder", "name a file")
         if self.output is not None and self.output.exists():
-            raise refuse(f"{self.output} exists already; remove it or name another folder with --output")
+            raise InputError(f"{self.output} exists already", "remove it or name another folder with --output")
         output = self.output or Path("outputs/detection") / self.data.resolve().stem
         console = Console(highlight=False, soft_wrap=True)
         cameras = cameras_of(self.data, self.frames)
@@ -83,4 +83,4 @@ def _write(path: Path, text: str) -> None:
     except OSError as error:
         if new:
             path.unlink(missing_ok=True)
-        raise refuse(f"{path} cannot be written ({error}); free space there or name another file") from error
+        raise InputError(f"{path} cannot be written ({error})", "free space there or name another file") from error

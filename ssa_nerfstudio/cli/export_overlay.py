@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -34,20 +34,20 @@ class Command:
         """Read the checkpoint, write, and say what could not be recovered.
 
         Raises:
-            BadInput: the arguments, the checkpoint or a photo cannot be worked with.
+            InputError: the arguments, the checkpoint or a photo cannot be worked with.
         """
         if not 0 < self.threshold < 1:
-            raise refuse(f"--threshold must be in (0, 1), got {self.threshold:g}")
+            raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")
         if self.camera is not None and self.apply is None:
-            raise refuse("--camera chooses the camera of --apply; add --apply PHOTOS")
+            raise InputError("--camera chooses the camera of --apply", "add --apply PHOTOS")
         from rich.console import Console
         from rich.progress import track
 
+        from ssa_nerfstudio.data.writing import staged_folder
+        from ssa_nerfstudio.export.artifact_files import write_overlay
+        from ssa_nerfstudio.export.artifact_layers import raw_layers, undistorted_layers
         from ssa_nerfstudio.export.checkpoint import Checkpoint
-        from ssa_nerfstudio.export.layers import raw_layers, undistorted_layers
-        from ssa_nerfstudio.export.overlay import write_overlay
         from ssa_nerfstudio.export.restoration import find_photos, restore_photos
-        from ssa_nerfstudio.simulation.staging import staged_folder
 
         checkpoint = Checkpoint.read(self.load_config, self.step)
         undistorted = undistorted_layers(checkpoint)
@@ -58,8 +58,8 @@ class Command:
             frames = [*raw, *undistorted]
             if len(raw) > 1:
                 if self.camera is None or not 0 <= self.camera < len(raw):
-                    raise refuse(
-                        f"the run has {len(raw)} cameras; say whose photos these are: --camera 0 to {len(raw) - 1}"
+                    raise InputError(
+                        f"the run has {len(raw)} cameras", f"say whose photos these are: --camera 0 to {len(raw) - 1}"
                     )
                 frames = [raw[self.camera], undistorted[self.camera]]
         console = Console(highlight=False, soft_wrap=True)

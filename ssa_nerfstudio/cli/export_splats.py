@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -36,13 +36,15 @@ class Command:
         """Read the checkpoint and write.
 
         Raises:
-            BadInput: the arguments or the checkpoint cannot be worked with.
+            InputError: the arguments or the checkpoint cannot be worked with.
         """
         box = self.obb_center, self.obb_rotation, self.obb_scale
         if any(box) and not all(box):
-            raise refuse("a box needs all of --obb-center, --obb-rotation and --obb-scale")
+            raise InputError("a box needs all of --obb-center, --obb-rotation and --obb-scale")
         if Path(self.output_filename).name != self.output_filename or not self.output_filename.endswith(".ply"):
-            raise refuse(f"--output-filename {self.output_filename} must be the name of a .ply file, without folders")
+            raise InputError(
+                f"--output-filename {self.output_filename} must be the name of a .ply file, without folders"
+            )
         from rich.console import Console
 
         from ssa_nerfstudio.export.checkpoint import Checkpoint
@@ -62,7 +64,7 @@ class Command:
                 paths.append(path.with_suffix(".compressed.ply"))
                 write_compressed_ply(paths[1], gaussians, selection.kept)
         except OSError as error:
-            raise refuse(f"{path} cannot be written ({error}); name another --output-dir") from error
+            raise InputError(f"{path} cannot be written ({error})", "name another --output-dir") from error
         for written in paths:
             console.print(f"{written}: {selection.kept.sum():,} Gaussians, {written.stat().st_size / 1e6:,.1f} MB")
         if selection.not_finite or selection.too_faint:

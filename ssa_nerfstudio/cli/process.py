@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -51,24 +51,24 @@ class Command:
         """Process, and say what was registered and what to do next.
 
         Raises:
-            BadInput: the arguments or files cannot be worked with, or too few photos were registered.
+            InputError: the arguments or files cannot be worked with, or too few photos were registered.
         """
         from rich.console import Console
 
-        from ssa_nerfstudio.capture.apart import Settings
-        from ssa_nerfstudio.capture.mask import read_mask
-        from ssa_nerfstudio.capture.process import process
-        from ssa_nerfstudio.capture.sources import read_source
+        from ssa_nerfstudio.data.sources import read_source
+        from ssa_nerfstudio.sfm.feature_mask import read_mask
+        from ssa_nerfstudio.sfm.photos_to_dataset import process
+        from ssa_nerfstudio.sfm.reconstruction import Settings
 
         for name, lowest in (("frames", 3), ("max_image_size", 64)):
             if (value := getattr(self, name)) < lowest:
-                raise refuse(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
+                raise InputError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
         if not 0 <= self.min_registered <= 1:
-            raise refuse(f"--min-registered is a share of the photos, from 0 to 1, got {self.min_registered}")
+            raise InputError(f"--min-registered is a share of the photos, from 0 to 1, got {self.min_registered}")
         if self.threads < 1 and self.threads != -1:
-            raise refuse(f"--threads must be at least 1, or -1 for one a core, got {self.threads}")
+            raise InputError(f"--threads must be at least 1, or -1 for one a core, got {self.threads}")
         if self.output.exists():
-            raise refuse(f"{self.output} exists already; remove it or name another folder with --output")
+            raise InputError(f"{self.output} exists already", "remove it or name another folder with --output")
         two = self.clean is not None
         sources = [read_source(self.train, "train" if two else "frame", least=3)]
         if self.clean is not None:

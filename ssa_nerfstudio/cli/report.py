@@ -22,15 +22,15 @@ class Command:
         """Write the report and say what was ignored.
 
         Raises:
-            BadInput: there are no results.
+            InputError: there are no results.
         """
         from rich.console import Console
 
-        from ssa_nerfstudio.benchmark.report import report
-        from ssa_nerfstudio.errors import refuse
+        from ssa_nerfstudio.errors import InputError
+        from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import report
 
         if not self.folders:
-            raise refuse("name the --output folder of ssa bench: ssa report DIR")
+            raise InputError("name the --output folder of ssa bench: ssa report DIR")
         files, problems = report([*self.folders], self.output or self.folders[0] / "report")
         console = Console(highlight=False, soft_wrap=True)
         for problem in problems:

@@ -7,7 +7,7 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -36,19 +36,19 @@ class Command:
         """Simulate, and say what to do next.
 
         Raises:
-            BadInput: the arguments, the dataset or a configuration cannot be worked with.
+            InputError: the arguments, the dataset or a configuration cannot be worked with.
         """
         from rich.console import Console
 
-        from ssa_nerfstudio.simulation.dataset import Dataset
-        from ssa_nerfstudio.simulation.scene import Scene, read_effects, read_scene
-        from ssa_nerfstudio.simulation.simulate import simulate
+        from ssa_nerfstudio.data.transforms import Dataset
+        from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects, read_scene
+        from ssa_nerfstudio.experiments.simulation.simulator import simulate
 
         if (self.effects is None) == (self.scene is None):
-            raise refuse("say what to simulate: either --effects NAME ... or --scene NAME")
+            raise InputError("say what to simulate: either --effects NAME ... or --scene NAME")
         for name, lowest in (("seed", 0), ("threads", 1)):
             if (value := getattr(self, name)) is not None and value < lowest:
-                raise refuse(f"--{name} must be at least {lowest}, got {value}")
+                raise InputError(f"--{name} must be at least {lowest}, got {value}")
         scene = Scene(read_effects(self.effects)) if self.effects is not None else read_scene(str(self.scene))
         if self.seed is not None:
             scene = dataclasses.replace(scene, seed=self.seed)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ssa_nerfstudio.cli.bench import Command as BenchCommand
 from ssa_nerfstudio.cli.bench import update
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 
 @dataclass
@@ -20,23 +20,23 @@ class Command(BenchCommand):
         """Run what is missing, then write frontier figures, CSV and tables into the folder's `tradeoff`.
 
         Raises:
-            BadInput: the arguments or the benchmark cannot be worked with, or no run had its device to itself.
+            InputError: the arguments or the benchmark cannot be worked with, or no run had its device to itself.
         """
         from rich.console import Console
 
-        from ssa_nerfstudio.benchmark.plan import plan_tradeoff
-        from ssa_nerfstudio.benchmark.specification import read_benchmark
+        from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
+        from ssa_nerfstudio.experiments.benchmark.specification.plan import plan_tradeoff
 
         benchmark = read_benchmark(self.benchmark)
         if benchmark.tradeoff is None:
-            raise refuse(f"{self.benchmark} states no tradeoff; add the key 'tradeoff' or name another benchmark")
+            raise InputError(f"{self.benchmark} states no tradeoff", "add the key 'tradeoff' or name another benchmark")
         planned = plan_tradeoff(benchmark)
         if not self.report_only:
             update(self, "tradeoff", benchmark, planned)
         if self.prepare_only or self.list:
             return
-        from ssa_nerfstudio.benchmark.bench import select
-        from ssa_nerfstudio.benchmark.tradeoff import analyse
+        from ssa_nerfstudio.experiments.benchmark.execution.execute import select
+        from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyse
 
         chosen = {run.id for run in select(planned, self.scenes, self.only)}
         console = Console(highlight=False, soft_wrap=True)

@@ -10,10 +10,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, step_of
-from ssa_nerfstudio.plugin.upstream import allow_checkpoint_scalars
+from ssa_nerfstudio.plugin.compat.upstream import allow_checkpoint_scalars
+from ssa_nerfstudio.plugin.training.checkpoints import damage, newest_first, step_of
 
 _MODEL = "_model."
 _MODELS_FOLDER = "nerfstudio_models"
@@ -39,17 +39,19 @@ class Checkpoint:
             step: which checkpoint; the newest where None.
 
         Raises:
-            BadInput: there is none, or it is no checkpoint of Gaussian splats.
+            InputError: there is none, or it is no checkpoint of Gaussian splats.
         """
         if not config.is_file():
-            raise refuse(f"--load-config {config} does not exist; give the config.yml that ns-train wrote")
+            raise InputError(f"--load-config {config} does not exist", "give the config.yml that ns-train wrote")
         folder = config.parent / _MODELS_FOLDER
         found = {step_of(path): path for path in newest_first(folder)}
         if step is not None and step not in found:
             there = ", ".join(map(str, sorted(found))) or "none"
-            raise refuse(f"{folder} has no checkpoint of step {step}; there are {there}")
+            raise InputError(f"{folder} has no checkpoint of step {step}", f"there are {there}")
         if not found:
-            raise refuse(f"{folder} holds no step-*.ckpt; give --load-config the config.yml of a run that saved one")
+            raise InputError(
+                f"{folder} holds no step-*.ckpt", "give --load-config the config.yml of a run that saved one"
+            )
         path = found[max(found) if step is None else step]
         allow_checkpoint_scalars()
         try:
@@ -58,10 +60,12 @@ class Checkpoint:
             at = int(saved["step"])
         except (RuntimeError, OSError, EOFError, UnpicklingError, KeyError, TypeError, AttributeError) as error:
             reason = damage(path) or (str(error) or type(error).__name__).splitlines()[0]
-            raise refuse(f"{path} cannot be read as a checkpoint ({reason}); copy it again or train again") from error
+            raise InputError(
+                f"{path} cannot be read as a checkpoint ({reason})", "copy it again or train again"
+            ) from error
         model = {name.removeprefix(_MODEL): value for name, value in state.items() if name.startswith(_MODEL)}
         if "gauss_params.means" not in model:
-            raise refuse(f"{path} holds no Gaussian splats; give a run of ssa-splatfacto or splatfacto")
+            raise InputError(f"{path} holds no Gaussian splats", "give a run of ssa-splatfacto or splatfacto")
         return Checkpoint(path, at, model)
 
     def gaussians(self) -> dict[str, Tensor]:
@@ -74,13 +78,13 @@ class Checkpoint:
         """The overlays.
 
         Raises:
-            BadInput: the run has none.
+            InputError: the run has none.
         """
         prefix = "artifacts."
         if not len(self.model.get(f"{prefix}camera_keys", ())):
-            raise refuse(
-                f"{self.path} has no overlay: it was trained with --pipeline.model.overlay off or by another method; "
-                "train it with ssa-splatfacto"
+            raise InputError(
+                f"{self.path} has no overlay: it was trained with --pipeline.model.overlay off or by another method",
+                "train it with ssa-splatfacto",
             )
         artifacts = Artifacts().eval()
         artifacts.make_room(self.model, prefix, wanted=True)

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from ssa_nerfstudio.errors import refuse
-from ssa_nerfstudio.export.layers import ArtifactLayers
-from ssa_nerfstudio.simulation.photos import UnusableFile, read_photo
+from ssa_nerfstudio.data.photos import read_photo
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 
 LEAST_TRANSMITTANCE = 0.05
 """A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one grey level would become twenty.
@@ -75,13 +75,15 @@ def find_photos(folder: Path) -> list[Path]:
     """The photos below a folder, sorted.
 
     Raises:
-        BadInput: there are none.
+        InputError: there are none.
     """
     if not folder.is_dir():
-        raise refuse(f"--apply {folder} is no folder; give the folder of the photos")
+        raise InputError(f"--apply {folder} is no folder", "give the folder of the photos")
     photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
     if not photos:
-        raise refuse(f"--apply {folder} holds no photos ({', '.join(sorted(SUFFIXES))}); give the folder of the photos")
+        raise InputError(
+            f"--apply {folder} holds no photos ({', '.join(sorted(SUFFIXES))})", "give the folder of the photos"
+        )
     return photos
 
 
@@ -93,13 +95,13 @@ def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
         frames: layers to choose from, those of raw frames first.
 
     Raises:
-        BadInput: the photo is unreadable or of another aspect.
+        InputError: the photo is unreadable or of another aspect.
     """
     try:
         with Image.open(path) as image:
             width, height = image.size
     except (OSError, SyntaxError, ValueError) as error:
-        raise refuse(f"{path} cannot be read as a photo ({error}); copy it again or remove it") from error
+        raise InputError(f"{path} cannot be read as a photo ({error})", "copy it again or remove it") from error
     for layers in frames:
         if (layers.camera.width, layers.camera.height) == (width, height):
             return layers
@@ -108,8 +110,8 @@ def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
         if abs(width / height / trained - 1) < SAME_ASPECT:
             return layers.sized(width, height)
     sizes = ", ".join(f"{f.camera.width} x {f.camera.height} ({f.frame})" for f in frames)
-    raise refuse(
-        f"{path} is {width} x {height}, the overlay's frame {sizes}; give photos of the camera it was trained on"
+    raise InputError(
+        f"{path} is {width} x {height}, the overlay's frame {sizes}", "give photos of the camera it was trained on"
     )
 
 
@@ -126,7 +128,7 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
         What became of each photo, in order.
 
     Raises:
-        BadInput: a photo is unreadable or of another frame.
+        InputError: a photo is unreadable or of another frame.
     """
     sized: dict[Path, ArtifactLayers] = {}
     for path in photos:
@@ -140,10 +142,7 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
 
     def one(path: Path) -> Recovery:
         layers = sized[path]
-        try:
-            photo = read_photo(path, layers.camera.width, layers.camera.height)
-        except UnusableFile as error:
-            raise refuse(str(error)) from error
+        photo = read_photo(path, layers.camera.width, layers.camera.height)
         clean, seen, implausible = restore(photo, layers)
         place = (output / "photos" / path.relative_to(folder)).with_suffix(".png")
         place.parent.mkdir(parents=True, exist_ok=True)

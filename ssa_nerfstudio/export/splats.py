@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 
 LOWEST_OPACITY = -5.5373
 """logit(1/255) as nerfstudio's exporter rounds it: fainter Gaussians are skipped by rasterizers and not exported."""
@@ -72,10 +72,10 @@ def write_ply(
         colors: spherical harmonics, or 8-bit red, green and blue of the constant term alone.
 
     Raises:
-        BadInput: no Gaussian is kept.
+        InputError: no Gaussian is kept.
     """
     if not kept.any():
-        raise refuse(f"no Gaussian of {len(kept)} is finite and visible: there is nothing to write to {path}")
+        raise InputError(f"no Gaussian of {len(kept)} is finite and visible: there is nothing to write to {path}")
     blocks = properties(gaussians, kept, colors)
     row = np.dtype([(str(number), values.dtype, values.shape[1:]) for number, (_, values) in enumerate(blocks)])
     count = int(kept.sum())
@@ -153,12 +153,12 @@ def write_compressed_ply(path: Path, gaussians: dict[str, Tensor], kept: np.ndar
         gaussians, kept: as for `write_ply`.
 
     Raises:
-        BadInput: no Gaussian is kept.
+        InputError: no Gaussian is kept.
     """
     import gsply  # loads slowly, and only this form needs it
 
     if not kept.any():
-        raise refuse(f"no Gaussian of {len(kept)} is finite and visible: there is nothing to write to {path}")
+        raise InputError(f"no Gaussian of {len(kept)} is finite and visible: there is nothing to write to {path}")
     arrays = {name: np.ascontiguousarray(values.float().numpy()[kept]) for name, values in gaussians.items()}
     quats = arrays["quats"] / np.linalg.norm(arrays["quats"], axis=1, keepdims=True).clip(1e-12)
     rest, harmonics = arrays["features_rest"], np.ascontiguousarray(_harmonics(gaussians)[kept])

@@ -1,0 +1,1 @@
+"""The differentiable screen-space overlay: parameters, compositing, losses, resampling."""

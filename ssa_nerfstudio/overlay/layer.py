@@ -10,13 +10,9 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.area import StaticArea
 from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats, paint
 from ssa_nerfstudio.overlay.resampling import letterbox, reduced_size, stack_premultiplied, to_training_scale
-from ssa_nerfstudio.overlay.statistics import ImageStatistics
 
-STATISTICS_SCALE = 0.05
-"""s of the paper: a pixel whose standard deviation over the views is s starts with a matte of 1 / e."""
 CONSTANT_START = (0.5, 0.1)
 """Colour and matte of the paper's ablation "constant start"."""
 MATTE_START_RANGE = (0.01, 0.99)
@@ -62,57 +58,19 @@ class ScreenSpaceOverlay(nn.Module):
         self._held: list[tuple[Tensor, Tensor]] = []
 
     @torch.no_grad()
-    def start_from(self, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
-        """Start from what is the same in all views: W = mean, A = exp(-sigma / 0.05).
-
-        A sky is as constant as a dashboard, but static edges enclose the dashboard alone. Told where an artifact would
-        be, only what is opaque starts so. Elsewhere A and W are those that its edges imply, but A at least 0.1 (that of
-        the constant start) near them and 0.01 far from them. Sparsity spares what is hidden.
+    def initialize(self, color: Tensor, alpha: Tensor, evidence: Tensor, near: Tensor) -> None:
+        """Start from given layers of the overlay's own size; both are clamped so that their logits are finite.
 
         Args:
-            statistics: of the photos.
-            area: where an artifact would be; None, as the paper has it: sigma decides alone.
-
-        Raises:
-            ValueError: where the statistics are of another frame.
+            color: W, straight color or the light that is added, [h, w, 3] in [0, 1].
+            alpha: A, [h, w, 1] in [0, 1].
+            evidence: r, [h, w, 1] in [0, 1], weight of the sparsity term.
+            near: [h, w, 1] bool, pixels that learn from the first step (`hold_far_pixels`).
         """
-        if statistics.size != (self.height, self.width):
-            raise ValueError(f"statistics of a frame {statistics.size} for an overlay of {(self.height, self.width)}")
-        if area is None:
-            area = StaticArea.plain(torch.ones(statistics.size, dtype=torch.bool))
-        mean, deviation = statistics.mean(), statistics.deviation()
-        opaque, near = (mask.to(mean.device)[..., None] for mask in (area.opaque, area.near))
-        matte, difference = area.matte.to(mean)[..., None], area.difference.to(mean)
-        least = torch.where(near, CONSTANT_START[1], MATTE_START_RANGE[0])
-        if self.adds_light:
-            matte, least = torch.zeros_like(matte), MATTE_START_RANGE[0]
-        # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the
-        # pixel, is 1, and its mean colour would be lost.
-        alpha = torch.where(opaque, torch.exp(-deviation / STATISTICS_SCALE), matte.clamp_min(least))
-        if self.adds_light:
-            addition = torch.where(opaque, alpha * mean, difference)
-        else:
-            scene = (mean - torch.where(opaque, 0.0, difference)).clamp(0, 1)
-            addition = torch.minimum(alpha * scene + mean - scene, alpha)
-            implied = (matte > 0) | (difference != 0).any(dim=-1, keepdim=True)
-            shown = torch.where(opaque, 0, matte)
-            if shown.any():
-                addition = torch.where(opaque | implied, addition, alpha * _mean_color(addition / alpha, shown))
-        layers = torch.cat([alpha, addition, deviation, opaque, matte, near], dim=-1)
-        size = self.alpha_logits.shape[:2]
-        if self.resolution > 1:
-            padded = nn.functional.pad(
-                layers.permute(2, 0, 1)[None],
-                (0, size[1] * self.resolution - self.width, 0, size[0] * self.resolution - self.height),
-                mode="replicate",
-            )
-            layers = nn.functional.avg_pool2d(padded, self.resolution)[0].permute(1, 2, 0)
-        alpha, addition, deviation, opaque, matte, near = layers.split((1, 3, 1, 1, 1, 1), dim=-1)
-        color = addition.clamp_min(MATTE_START_RANGE[0]) if self.adds_light else addition / alpha
         self.color_logits.copy_(color.clamp(*COLOR_START_RANGE).logit())
         self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
-        self.evidence.copy_(torch.minimum(_evidence(deviation, opaque), 1 - matte))
-        self.near.copy_(near > 0)
+        self.evidence.copy_(evidence)
+        self.near.copy_(near)
 
     @torch.no_grad()
     def wait_for_the_scene(self, waiting: bool) -> None:
@@ -229,26 +187,3 @@ def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) 
     """An overlay's layers in a frame of any size and aspect: scaled, centred, never stretched; clear around it."""
     transmittance, addition = overlay.layers()
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)
-
-
-def _mean_color(color: Tensor, matte: Tensor) -> Tensor:
-    """The mean colour [3] of an artifact, of colours [H, W, 3] weighed by a matte [H, W, 1].
-
-    Where an artifact was missed, its colour is most likely this one, and a film of it is learned no sooner than it is
-    there. From the mean of the photos, the matte grows wherever a render is wrong: less contrast is a smaller error.
-    """
-    return (color.clamp(0, 1) * matte).sum(dim=(0, 1)) / matte.sum()
-
-
-def _evidence(deviation: Tensor, opaque: Tensor) -> Tensor:
-    """r: how much the sparsity weighs on a pixel, 1 where nothing is opaque (its share of the pixel).
-
-    There, r = min(1, sigma / 70th percentile of sigma), near 0 where the views agree, so that sparsity spares what an
-    artifact hides. A sky agrees with itself, too; but it is not taken for opaque, and sparsity weighs.
-    """
-    values = deviation.flatten().float()
-    rank = max(1, round(0.7 * values.numel()))
-    reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
-    if reference <= 0:
-        return torch.ones_like(deviation)
-    return 1 - opaque * (1 - (deviation / reference).clamp_max(1.0))

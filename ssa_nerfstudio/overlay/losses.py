@@ -138,11 +138,11 @@ class _Photometric(torch.autograd.Function):
     def forward(ctx, prediction: Tensor, target: Tensor, ssim_weight: float) -> Tensor:  # pyright: ignore
         x, y = prediction.detach(), target.detach().to(prediction.dtype)
         if x.is_cuda and _triton_available():
-            from ssa_nerfstudio.overlay._photometric_triton import value_and_gradient
+            from ssa_nerfstudio.overlay._kernels.photometric_triton import value_and_gradient
 
             value, gradient = value_and_gradient(x, y, ssim_weight, gaussian_window())
         elif x.device.type == "cpu":
-            from ssa_nerfstudio.overlay._photometric_numba import value_and_gradient
+            from ssa_nerfstudio.overlay._kernels.photometric_numba import value_and_gradient
 
             x_planes, y_planes = (image.permute(2, 0, 1).contiguous().numpy() for image in (x, y))
             window = np.array(gaussian_window(), x_planes.dtype)

@@ -10,10 +10,10 @@ import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
-from ssa_nerfstudio.errors import refuse
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
 from ssa_nerfstudio.overlay.resampling import straight_color
-from ssa_nerfstudio.plugin.camera_groups import LENS_VALUES, find_frame, match_camera, nearest_aspect
+from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES, find_frame, match_camera, nearest_aspect
 
 Overlay = ScreenSpaceOverlay | GivenOverlay
 
@@ -134,14 +134,16 @@ class Artifacts(nn.Module):
         if len(self) or len(self.bare_keys):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
             if frames != here or (frames and given != isinstance(self[0], GivenOverlay)):
-                raise refuse(
-                    f"the checkpoint's overlays are {'given' if given else 'learned'}, (height, width, downscale, adds "
-                    f"light) {frames or 'absent'}, this run's are {here or 'absent'}; resume with the photos, "
-                    "camera-res-scale-factor and overlay options it was trained with"
+                raise InputError(
+                    f"the checkpoint's overlays are {('given' if given else 'learned')}, (height, width, downscale, "
+                    f"adds light) {frames or 'absent'}, this run's are {here or 'absent'}",
+                    "resume with the photos, camera-res-scale-factor and overlay options it was trained with",
                 )
             return
         if frames and not wanted:
-            raise refuse("the checkpoint has an overlay and this run has none; resume with --pipeline.model.overlay on")
+            raise InputError(
+                "the checkpoint has an overlay and this run has none", "resume with --pipeline.model.overlay on"
+            )
         device = self.camera_keys.device
         self.overlays = nn.ModuleList(
             GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3))
@@ -161,14 +163,14 @@ class Artifacts(nn.Module):
             setting: this run's overlay: auto, on or given.
 
         Raises:
-            BadInput: the checkpoint knows no camera like one of this run's, or was trained with another setting.
+            InputError: the checkpoint knows no camera like one of this run's, or was trained with another setting.
         """
         self.make_room(state, prefix, wanted=True)
         here = "given" if len(self) and isinstance(self[0], GivenOverlay) else "on" if len(self) else "off"
         if setting not in ("auto", here):
-            raise refuse(
-                f"the checkpoint was trained with overlay {here}, this run has {setting}; resume with "
-                f"--pipeline.model.overlay {'auto' if here == 'off' else here}"
+            raise InputError(
+                f"the checkpoint was trained with overlay {here}, this run has {setting}",
+                f"resume with --pipeline.model.overlay {('auto' if here == 'off' else here)}",
             )
         known = torch.cat([state.get(f"{prefix}{name}", torch.zeros(0, 6)) for name in ("camera_keys", "bare_keys")])
         places: list[int | None] = []
@@ -176,9 +178,9 @@ class Artifacts(nn.Module):
             place = find_frame(key, known) if len(known) else len(self)
             if place is None:
                 there = sorted({(int(width), int(height)) for width, height in known[:, :2].tolist()})
-                raise refuse(
-                    f"the checkpoint was trained on frames (width, height) of {there}, this run has "
-                    f"{tuple(key[:2].int().tolist())}; resume with the photos and camera-res-scale-factor of then"
+                raise InputError(
+                    f"the checkpoint was trained on frames (width, height) of {there}, this run has {tuple(key[:2].int().tolist())}",
+                    "resume with the photos and camera-res-scale-factor of then",
                 )
             places.append(place if place < len(self) else None)
         self._group_of_view = [places[group] for group in groups]

@@ -11,15 +11,11 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
 
-from ssa_nerfstudio.errors import refuse
-from ssa_nerfstudio.plugin.cameras import prepare
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.view_geometry import prepare
 
 TRAINING_REDUCTIONS = (1, 2, 4, 8)
 """Factors by which splatfacto's resolution schedule reduces photos, for which intrinsics are kept ready."""
-
-
-class UnreadablePhoto(ValueError):
-    """A file that should be a photo and is none."""
 
 
 class NamedInputDataset(InputDataset):
@@ -29,16 +25,16 @@ class NamedInputDataset(InputDataset):
         """Decode one photo: uint8 [H, W, 3 or 4].
 
         Raises:
-            UnreadablePhoto: with the file's name, where it cannot be decoded.
+            InputError: with the file's name, where it cannot be decoded.
         """
         path = self.image_filenames[image_idx]
         try:
             return super().get_numpy_image(image_idx)
         except FileNotFoundError as error:
-            raise UnreadablePhoto(f"{path} does not exist; put the photo there or remove its frame") from error
+            raise InputError(f"{path} does not exist", "put the photo there or remove its frame") from error
         except (OSError, SyntaxError, ValueError, AssertionError) as error:
-            raise UnreadablePhoto(
-                f"{path} cannot be read as a photo ({error}); copy it again from its source or remove its frame"
+            raise InputError(
+                f"{path} cannot be read as a photo ({error})", "copy it again from its source or remove its frame"
             ) from error
 
 
@@ -63,10 +59,8 @@ class SSADatamanager(FullImageDatamanager[NamedInputDataset]):
             cache_images_device = "gpu"
         try:
             return super()._load_images(split, cache_images_device)
-        except UnreadablePhoto as error:
-            raise refuse(str(error)) from error
         except AssertionError as error:
-            raise refuse(f"{error}; write w and h in transforms.json as the photos are") from error
+            raise InputError(f"{error}", "write w and h in transforms.json as the photos are") from error
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """Camera and photo of one training view; every view once before any comes again.

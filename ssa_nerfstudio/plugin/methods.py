@@ -7,14 +7,16 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from ssa_nerfstudio.plugin import open3d_libraries, upstream
+from ssa_nerfstudio.plugin import command_entry
+from ssa_nerfstudio.plugin.compat import open3d_libraries, upstream
 from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
-from ssa_nerfstudio.plugin.fused_adam import FusedAdamConfig
+from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipelineConfig
-from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig, machine
+from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 
 # Every nerfstudio command imports this module through the entry points, before it loads or renders anything.
+command_entry.report_in_one_line()
 open3d_libraries.preload()
 upstream.allow_checkpoint_scalars()
 upstream.give_mcmc_a_cpu_body()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import dataclass, field
 from typing import Any
 
 import torch
@@ -13,19 +15,27 @@ from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio.errors import warn
 from ssa_nerfstudio.overlay.compositing import clipped, composite
 from ssa_nerfstudio.overlay.losses import photometric, sparsity
 from ssa_nerfstudio.overlay.resampling import straight_color
-from ssa_nerfstudio.plugin import guards
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.cameras import frame, intrinsics, metadata, view_matrix
-from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
-from ssa_nerfstudio.plugin.figures import figures_of_step, figures_of_view, pictures_of_view
-from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
-from ssa_nerfstudio.plugin.upstream import without_lpips
+from ssa_nerfstudio.plugin.compat.upstream import without_lpips
+from ssa_nerfstudio.plugin.evaluation import figures_of_step, figures_of_view, pictures_of_view
+from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.training import nonfinite as guards
+from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, in_viewer
 from ssa_nerfstudio.rasterization import rasterizer
+
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass
+class SSASplatfactoModelConfig(ModelSettings):
+    """Configuration of `SSASplatfactoModel`."""
+
+    _target: type = field(default_factory=lambda: SSASplatfactoModel)
 
 
 class SSASplatfactoModel(SplatfactoModel):
@@ -104,7 +114,7 @@ class SSASplatfactoModel(SplatfactoModel):
         if not self.config.guards or outside.all():
             return
         if not outside.any():
-            warn(
+            _LOG.warning(
                 f"every start point is within {guards.START_DISTANCE} of a camera, nearer than any is drawn: the scene "
                 "is too small; leave --pipeline.datamanager.dataparser.auto-scale-poses True"
             )

@@ -11,13 +11,12 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from ssa_nerfstudio.plugin.camera_groups import describe_lenses, group_cameras
-from ssa_nerfstudio.plugin.checkpoints import saved_pipeline
+from ssa_nerfstudio.plugin.camera_matching import describe_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
-from ssa_nerfstudio.plugin.first_look import given_overlays, learned_overlays
-from ssa_nerfstudio.plugin.inputs import check_device, check_settings, check_transforms, check_views
-from ssa_nerfstudio.plugin.model import SSASplatfactoModel
-from ssa_nerfstudio.plugin.settings import SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.overlay_setup import given_overlays, learned_overlays
+from ssa_nerfstudio.plugin.training.checkpoints import saved_pipeline
+from ssa_nerfstudio.plugin.validation import check_device, check_settings, check_transforms, check_views
 
 
 @dataclass

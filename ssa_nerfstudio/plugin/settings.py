@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -13,10 +13,9 @@ from ssa_nerfstudio.rasterization import RasterizerName
 
 
 @dataclass
-class SSASplatfactoModelConfig(SplatfactoModelConfig):
-    """Configuration of `SSASplatfactoModel`: splatfacto's, and the artifact's."""
+class ModelSettings(SplatfactoModelConfig):
+    """splatfacto's settings and ours; `model.SSASplatfactoModelConfig` adds the class that they configure."""
 
-    _target: type = field(default_factory=lambda: _model())
     overlay: Literal["auto", "on", "off", "given"] = "auto"
     """auto: learn an artifact in front of the cameras that detection finds one in front of, and pay for nothing else;
     on: learn one in front of every camera; off: plain splatfacto; given: take the true one from overlay_given."""
@@ -69,9 +68,3 @@ class SSASplatfactoModelConfig(SplatfactoModelConfig):
     """Guards: so many skipped steps in a row end the training; looked at every 100 steps."""
     rasterizer: RasterizerName = "auto"
     """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""
-
-
-def _model() -> type:
-    from ssa_nerfstudio.plugin.model import SSASplatfactoModel  # which imports this module
-
-    return SSASplatfactoModel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 from pickle import UnpicklingError
@@ -13,14 +14,16 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ssa_nerfstudio.errors import give_up, refuse, warn
-from ssa_nerfstudio.plugin.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
-from ssa_nerfstudio.plugin.event_writers import spare_event_writers
-from ssa_nerfstudio.plugin.guards import READ_EVERY, SeedingScaler, StepGuard, first_not_finite
-from ssa_nerfstudio.plugin.inputs import check_checkpoint, check_device
-from ssa_nerfstudio.plugin.optimizers import JointOptimizers
+from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
-from ssa_nerfstudio.plugin.schedules import scaled
+from ssa_nerfstudio.plugin.training.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
+from ssa_nerfstudio.plugin.training.event_writers import spare_event_writers
+from ssa_nerfstudio.plugin.training.nonfinite import READ_EVERY, SeedingScaler, StepGuard, first_not_finite
+from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
+from ssa_nerfstudio.plugin.training.schedules import scaled
+from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -105,7 +108,7 @@ class SSATrainer(Trainer):
         if folder is None or step is not None:
             error = self._load_one()
             if error is not None:
-                raise refuse(f"{file or folder} cannot be read ({error}); name another checkpoint: --load-step")
+                raise InputError(f"{file or folder} cannot be read ({error})", "name another checkpoint: --load-step")
             return
         candidates = newest_first(folder)
         for candidate in candidates:
@@ -113,11 +116,13 @@ class SSATrainer(Trainer):
             error = damage(candidate) or self._load_one()
             if error is None:
                 if candidate != candidates[0]:
-                    warn(f"resuming from {candidate}, the newest checkpoint that is whole")
+                    _LOG.warning(f"resuming from {candidate}, the newest checkpoint that is whole")
                 self.config.load_step = None
                 return
-            warn(f"{candidate} cannot be used ({error})")
-        raise refuse(f"{folder} holds no checkpoint that can be read; give the folder of another run, or train anew")
+            _LOG.warning(f"{candidate} cannot be used ({error})")
+        raise InputError(
+            f"{folder} holds no checkpoint that can be read", "give the folder of another run, or train anew"
+        )
 
     def _load_one(self) -> str | None:
         """Load what the configuration names; what is wrong with it, if anything is."""
@@ -135,9 +140,10 @@ class SSATrainer(Trainer):
         states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
         broken = first_not_finite({**self.pipeline.state_dict(), **states})
         if broken is not None:
-            raise give_up(
+            raise TrainingError(
                 f"training stopped at step {step}: {broken} holds values that are not finite, so no checkpoint was "
-                f"written; resume from an earlier one: --load-dir {self.checkpoint_dir}"
+                "written",
+                f"resume from an earlier one: --load-dir {self.checkpoint_dir}",
             )
         folder = self.checkpoint_dir
         try:
@@ -146,9 +152,9 @@ class SSATrainer(Trainer):
         except (OSError, RuntimeError) as error:
             earlier = newest_first(folder)
             remedy = f"resume from {earlier[0]}: --load-dir {folder}" if earlier else "train anew"
-            raise give_up(
-                f"the checkpoint of step {step} could not be written to {folder} ({str(error).splitlines()[0]}); make "
-                f"room on the disk and {remedy}"
+            raise TrainingError(
+                f"the checkpoint of step {step} could not be written to {folder} ({str(error).splitlines()[0]})",
+                f"make room on the disk and {remedy}",
             ) from error
         finally:
             self.checkpoint_dir = folder

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.rasterization import _kernels
+from ssa_nerfstudio._system.kernel_threads import on_all_threads
+from ssa_nerfstudio.rasterization import _blending_kernels as _kernels
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.cpu_projection import project
 from ssa_nerfstudio.rasterization.interface import rasterization_with
 from ssa_nerfstudio.rasterization.projection import Splats
-from ssa_nerfstudio.threads import on_all_threads
 
 
 def blend(

@@ -6,10 +6,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio._system.kernel_threads import on_all_threads
 from ssa_nerfstudio.rasterization import _projection_kernels as kernels
 from ssa_nerfstudio.rasterization import projection
 from ssa_nerfstudio.rasterization.projection import Splats
-from ssa_nerfstudio.threads import on_all_threads
 
 HIGHEST_DEGREE = 3
 """Degree of spherical harmonics up to which there is a kernel."""

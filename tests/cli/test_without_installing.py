@@ -8,8 +8,8 @@ import sys
 import sysconfig
 from pathlib import Path
 
-from ssa_nerfstudio.benchmark.plan import plan
-from ssa_nerfstudio.benchmark.specification import read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
 
 CLONE = Path(__file__).parents[2]
 

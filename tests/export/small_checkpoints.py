@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ssa_nerfstudio.cameras.lens import Lens, undistorted
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.lens import Lens, undistorted
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 
 

@@ -12,15 +12,14 @@ import torch
 from PIL import Image
 from small_checkpoints import cameras, one_camera, write_run
 
-from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.effects.catalogue import effect_class
-from ssa_nerfstudio.effects.layers import Layers
-from ssa_nerfstudio.errors import BadInput
-from ssa_nerfstudio.export.overlay import FILES
+from ssa_nerfstudio.experiments.effects.catalogue import effect_class
+from ssa_nerfstudio.experiments.effects.layers import Layers
+from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
+from ssa_nerfstudio.experiments.simulation.corruption import undistorted_layers
+from ssa_nerfstudio.export.artifact_files import FILES
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.lens import Lens, distort, undistorted
-from ssa_nerfstudio.simulation.corruption import undistorted_layers
 
 WIDTH, HEIGHT = 96, 64
 
@@ -282,7 +281,7 @@ def test_a_checkpoint_of_the_first_version_is_still_read(tmp_path, capsys):
     export(old_run(tmp_path / "run"), tmp_path / "out")
     export(write_run(tmp_path / "new", one_camera(learned())), tmp_path / "of-new")
     assert (tmp_path / "out" / "overlay.png").read_bytes() == (tmp_path / "of-new" / "overlay.png").read_bytes()
-    with pytest.raises(BadInput):
+    with pytest.raises(SystemExit):
         export(old_run(tmp_path / "run"), tmp_path / "raw", "--raw-frame")
     assert "leave out --raw-frame" in capsys.readouterr().err
     assert not (tmp_path / "raw").exists()
@@ -341,7 +340,7 @@ def test_photos_of_a_rig_need_to_know_their_camera(tmp_path, capsys):
     config = write_run(tmp_path / "run", cameras(pairs))
     (tmp_path / "photos").mkdir()
     Image.fromarray(marks[1].apply(photo())).save(tmp_path / "photos" / "a.png")
-    with pytest.raises(BadInput):
+    with pytest.raises(SystemExit):
         export(config, tmp_path / "out", "--apply", tmp_path / "photos")
     assert "--camera 0 to 1" in capsys.readouterr().err
     export(config, tmp_path / "out", "--apply", tmp_path / "photos", "--camera", 1)
@@ -381,7 +380,7 @@ def spoil_photo(tmp_path: Path) -> list[object]:
 )
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(tmp_path, capsys, options, complaint):
     config = write_run(tmp_path / "run", one_camera(learned()))
-    with pytest.raises(BadInput) as caught:
+    with pytest.raises(SystemExit) as caught:
         export(config, tmp_path / "out", *options(tmp_path))
     assert caught.value.code == 2
     assert complaint in capsys.readouterr().err
@@ -406,6 +405,6 @@ def test_foreign_and_broken_checkpoints_are_refused(tmp_path, capsys):
             path.write_bytes(path.read_bytes()[:500])
         elif name == "nerf":
             torch.save({"step": 1, "pipeline": {"_model.field.weight": torch.zeros(2)}}, path)
-        with pytest.raises(BadInput):
+        with pytest.raises(SystemExit):
             export(config, tmp_path / "out")
         assert complaint in capsys.readouterr().err

@@ -12,9 +12,8 @@ from nerfstudio.scripts.exporter import ExportGaussianSplat
 from plyfile import PlyData
 from small_checkpoints import random_gaussians, write_run
 
-from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.errors import BadInput
+from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 
 
 def export(config: Path, output: Path, *options: object) -> Path:
@@ -140,7 +139,7 @@ def test_nothing_visible_is_refused_and_leaves_the_old_file(tmp_path, capsys):
     before = export(config, tmp_path / "out").read_bytes()
     gaussians["opacities"][:] = -9
     write_run(tmp_path / "run", None, gaussians, step=11)
-    with pytest.raises(BadInput):
+    with pytest.raises(SystemExit):
         export(config, tmp_path / "out")
     assert "no Gaussian of 5 is finite and visible" in capsys.readouterr().err
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["splat.ply"]
@@ -157,7 +156,7 @@ def test_nothing_visible_is_refused_and_leaves_the_old_file(tmp_path, capsys):
 )
 def test_contradicting_options_are_refused(tmp_path, capsys, options, complaint):
     config = write_run(tmp_path / "run", None)
-    with pytest.raises(BadInput):
+    with pytest.raises(SystemExit):
         export(config, tmp_path / "out", *options)
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

@@ -13,11 +13,12 @@ from hypothesis import strategies as st
 from nerfstudio.models.splatfacto import resize_image
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.area import StaticArea
+from ssa_nerfstudio.evidence.detection import static_area
+from ssa_nerfstudio.evidence.initialization import initialize
+from ssa_nerfstudio.evidence.static_area import StaticArea
+from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.compositing import clipped, composite
-from ssa_nerfstudio.overlay.detection import static_area
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 
 
 def random(*shape: int, seed: int = 0, dtype: torch.dtype = torch.float32) -> Tensor:
@@ -53,7 +54,7 @@ def test_a_new_overlay_has_the_constant_start_of_the_paper() -> None:
 def test_colour_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_over_0_05() -> None:
     photos, statistics = capture(9, 13)
     overlay = ScreenSpaceOverlay(9, 13)
-    overlay.start_from(statistics)
+    initialize(overlay, statistics)
     values = photos / 255
     mean = np.clip(values.mean(axis=0), 1 / 510, 1 - 1 / 510)
     sigma = values.std(axis=0).max(axis=-1, keepdims=True)
@@ -75,13 +76,13 @@ def test_by_default_only_what_static_edges_enclose_starts_opaque(resolution: int
         photo[36:] = (40, 30, 20)
     statistics = accumulate((torch.from_numpy(photo), None) for photo in photos)
     overlay = ScreenSpaceOverlay(48, 64, resolution)
-    overlay.start_from(statistics, static_area(statistics))
+    initialize(overlay, statistics, static_area(statistics))
     matte, evidence = (t.detach().repeat_interleave(resolution, 0) for t in (overlay.matte(), overlay.evidence))
     torch.testing.assert_close(matte[38:], torch.full_like(matte[38:], 0.99))
     torch.testing.assert_close(matte[:12], torch.full_like(matte[:12], 0.01))
     assert (evidence[38:] == 0).all()
     assert (evidence[:12] == 1).all()
-    overlay.start_from(statistics)
+    initialize(overlay, statistics)
     assert (overlay.matte() > 0.98).double().mean() > 0.45
 
 
@@ -89,7 +90,7 @@ def test_black_white_and_constant_pixels_start_with_finite_logits() -> None:
     photo = torch.zeros(4, 6, 3, dtype=torch.uint8)
     photo[:, 3:] = 255
     overlay = ScreenSpaceOverlay(4, 6)
-    overlay.start_from(accumulate((photo, None) for _ in range(3)))
+    initialize(overlay, accumulate((photo, None) for _ in range(3)))
     assert all(parameter.isfinite().all() for parameter in overlay.parameters())
     torch.testing.assert_close(overlay.matte(), torch.full((4, 6, 1), 0.99))
     assert (overlay.color()[:, :3] < 0.0021).all()
@@ -103,7 +104,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
     once[:2] = False
     never[:, :2] = False
     overlay = ScreenSpaceOverlay(4, 4, resolution)
-    overlay.start_from(accumulate([(photo, never), (photo, never & once)]))
+    initialize(overlay, accumulate([(photo, never), (photo, never & once)]))
     color, matte = (t.detach().repeat_interleave(resolution, 0).repeat_interleave(resolution, 1) for t in (
         overlay.color(), overlay.matte()
     ))  # fmt: skip
@@ -117,7 +118,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
 def test_a_start_of_coarser_resolution_averages_the_premultiplied_colours() -> None:
     photos, statistics = capture(8, 12)
     overlay = ScreenSpaceOverlay(8, 12, 2)
-    overlay.start_from(statistics)
+    initialize(overlay, statistics)
     values = photos / 255
     alpha = np.exp(-values.std(axis=0).max(axis=-1, keepdims=True) / 0.05)
     blocks = np.concatenate([alpha, alpha * values.mean(axis=0)], axis=-1).reshape(4, 2, 6, 2, 4).mean(axis=(1, 3))
@@ -131,7 +132,7 @@ def test_the_rows_that_fill_no_block_start_from_the_pixels_that_there_are(resolu
     photo = torch.zeros(9, 7, 3, dtype=torch.uint8)
     photo[8:], photo[:, 6:] = 204, 204
     overlay = ScreenSpaceOverlay(9, 7, resolution)
-    overlay.start_from(accumulate((photo, None) for _ in range(2)))
+    initialize(overlay, accumulate((photo, None) for _ in range(2)))
     assert overlay.color().shape[:2] == (-(-9 // resolution), -(-7 // resolution))
     torch.testing.assert_close(overlay.color()[-1], torch.full_like(overlay.color()[-1], 0.8))
     torch.testing.assert_close(overlay.matte(), torch.full_like(overlay.matte(), 0.99))
@@ -140,7 +141,7 @@ def test_the_rows_that_fill_no_block_start_from_the_pixels_that_there_are(resolu
 def test_statistics_of_another_frame_are_refused() -> None:
     _, statistics = capture(8, 12)
     with pytest.raises(ValueError, match=r"statistics of a frame \(8, 12\) for an overlay of \(12, 8\)"):
-        ScreenSpaceOverlay(12, 8).start_from(statistics)
+        initialize(ScreenSpaceOverlay(12, 8), statistics)
 
 
 def area_of(opaque: np.ndarray, near: np.ndarray, matte: float, difference: float, light: bool = False) -> StaticArea:
@@ -167,7 +168,7 @@ def test_evidence_is_the_deviation_over_its_70th_percentile_where_opaque_and_one
     photos, statistics = capture(10, 20)
     overlay = ScreenSpaceOverlay(10, 20)
     opaque, near = halves(10, 20)
-    overlay.start_from(statistics, area_of(opaque, near, matte=0.3, difference=0.1))
+    initialize(overlay, statistics, area_of(opaque, near, matte=0.3, difference=0.1))
     sigma = (photos / 255).std(axis=0).max(axis=-1)
     reference = np.sort(sigma.ravel())[140 - 1]  # the 140th of 200
     expected = np.minimum(np.where(opaque, np.minimum(1, sigma / reference), 1), np.where(near, 0.7, 1))
@@ -183,7 +184,7 @@ def test_what_the_edges_imply_is_what_the_layers_start_from(resolution: int) -> 
     mean = photos.mean(axis=0) / 255
     opaque, near = halves(12, 16)
     overlay = ScreenSpaceOverlay(12, 16, resolution)
-    overlay.start_from(statistics, area_of(opaque, near, matte=0.3, difference=0.05))
+    initialize(overlay, statistics, area_of(opaque, near, matte=0.3, difference=0.05))
     transmittance, addition = (layer.detach().numpy() for layer in overlay.layers(resolution))
     blocks = mean.reshape(12 // resolution, resolution, 16 // resolution, resolution, 3).mean(axis=(1, 3))
     faint = np.zeros(transmittance.shape[:2], bool)
@@ -212,7 +213,7 @@ def test_where_edges_imply_nothing_the_overlay_starts_in_the_colour_that_it_has_
         adds_light=False,
     )
     overlay = ScreenSpaceOverlay(8, 16)
-    overlay.start_from(statistics, area)
+    initialize(overlay, statistics, area)
     torch.testing.assert_close(overlay.color(), color.expand(8, 16, 3), atol=1e-3, rtol=0)
     torch.testing.assert_close(overlay.matte()[..., 0], matte.clamp_min(0.1), atol=1e-3, rtol=0)
 
@@ -227,7 +228,7 @@ def test_what_is_opaque_or_only_coloured_keeps_its_own_colour_and_what_is_opaque
     difference[:, 3:9] = 0.05
     everywhere = torch.ones(6, 12, dtype=torch.bool)
     overlay = ScreenSpaceOverlay(6, 12)
-    overlay.start_from(statistics, StaticArea(everywhere, everywhere, opaque, matte, difference, adds_light=False))
+    initialize(overlay, statistics, StaticArea(everywhere, everywhere, opaque, matte, difference, adds_light=False))
     color = overlay.color().detach()
     implied = (mean - (1 - torch.clamp(matte, min=0.1)[..., None]) * (mean - difference).clamp(0, 1)) / torch.clamp(
         matte, min=0.1
@@ -243,7 +244,7 @@ def test_what_adds_light_starts_from_the_difference_and_hides_only_where_it_is_o
     _, statistics = capture(12, 16)
     opaque, near = halves(12, 16)
     overlay = ScreenSpaceOverlay(12, 16, resolution, adds_light=True)
-    overlay.start_from(statistics, area_of(opaque, near, matte=0.3, difference=0.2, light=True))
+    initialize(overlay, statistics, area_of(opaque, near, matte=0.3, difference=0.2, light=True))
     matte, light = overlay.matte().detach(), overlay.color().detach()
     quarter = 4 // resolution
     torch.testing.assert_close(light[:, quarter : 2 * quarter], torch.full_like(light[:, quarter : 2 * quarter], 0.2))
@@ -257,7 +258,7 @@ def test_where_most_pixels_never_change_there_is_no_scale_and_evidence_stays_one
     photos = np.full((4, 5, 5, 3), 80, np.uint8)
     photos[1, 2, 2] = 90
     overlay = ScreenSpaceOverlay(5, 5)
-    overlay.start_from(accumulate((torch.from_numpy(photo), None) for photo in photos))
+    initialize(overlay, accumulate((torch.from_numpy(photo), None) for photo in photos))
     assert (overlay.evidence == 1).all()
 
 
@@ -376,7 +377,7 @@ def test_the_scene_gets_the_share_of_the_gradient_that_the_matte_lets_through() 
 def test_a_state_dict_brings_the_overlay_back(resolution: int, adds_light: bool) -> None:
     _, statistics = capture(9, 13)
     overlay = ScreenSpaceOverlay(9, 13, resolution, adds_light)
-    overlay.start_from(statistics)
+    initialize(overlay, statistics)
     file = io.BytesIO()
     torch.save(overlay.state_dict(), file)
     file.seek(0)

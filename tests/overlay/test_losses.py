@@ -286,7 +286,7 @@ def test_adam_moves_the_matte_at_real_resolutions_only_with_an_eps_below_the_gra
 
 INTERPRETED = """
 import torch
-from ssa_nerfstudio.overlay._photometric_triton import value_and_gradient
+from ssa_nerfstudio.overlay._kernels.photometric_triton import value_and_gradient
 from ssa_nerfstudio.overlay.losses import gaussian_window, photometric_reference
 
 torch.manual_seed(0)

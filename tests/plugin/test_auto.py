@@ -13,10 +13,10 @@ from conftest import edit_transforms
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from ssa_nerfstudio.benchmark.guards import Training
-from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
-from ssa_nerfstudio.demo.scene import DemoScene
-from ssa_nerfstudio.plugin import first_look
+from benchmarks.guards import Training
+from ssa_nerfstudio.experiments.runs.training_run import METHODS, configure, train_and_evaluate
+from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+from ssa_nerfstudio.plugin import overlay_setup as first_look
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 

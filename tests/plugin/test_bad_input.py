@@ -13,15 +13,14 @@ import pytest
 import torch
 from conftest import edit_transforms
 
-from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
-from ssa_nerfstudio.errors import BadInput
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 
 
 def refusal(capsys: pytest.CaptureFixture, run: Callable) -> str:
     """The one line with which `run` is refused."""
-    with pytest.raises(BadInput) as caught:
+    with pytest.raises(InputError) as caught:
         run()
-    assert caught.value.code == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ssa-nerfstudio: error:")]
     assert len(lines) == 1
     return lines[0]

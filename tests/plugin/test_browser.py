@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
-from ssa_nerfstudio.demo import screenshots
+from benchmarks import screenshots
+from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 from ssa_nerfstudio.export.checkpoint import Checkpoint
 from ssa_nerfstudio.overlay.layer import fitted
 from ssa_nerfstudio.overlay.resampling import straight_color

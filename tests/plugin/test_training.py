@@ -14,11 +14,11 @@ from nerfstudio.models.splatfacto import SplatfactoModel
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from ssa_nerfstudio.benchmark.run import METHODS, configure, train_and_evaluate
-from ssa_nerfstudio.effects.dashboard import Dashboard
-from ssa_nerfstudio.overlay.statistics import accumulate
+from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
+from ssa_nerfstudio.experiments.runs.training_run import METHODS, configure, train_and_evaluate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.schedules import scaled
+from ssa_nerfstudio.plugin.training.schedules import scaled
 
 
 def run(data: Path, output: Path, steps: int, method: str = "ssa-splatfacto", **model):

@@ -13,7 +13,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
-from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
+from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.viewer import OnDemand
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterization_scenes import assert_cpu_agrees_with_reference, cast, scene
 
-from ssa_nerfstudio.benchmark.rasterizers import random_scene
+from benchmarks.rasterizers import random_scene
 
 both_dtypes = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rasterization_scenes import BODIES, TOLERANCE, Scene, cast, scene, view
 from torch import Tensor
 
-from ssa_nerfstudio.benchmark.rasterizers import draw, relative_error
+from benchmarks.rasterizers import draw, relative_error
 from ssa_nerfstudio.rasterization import cpu_projection, projection
 from ssa_nerfstudio.rasterization.projection import Splats
 

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rasterization_scenes import BODIES, scene, torch_threads
 
-from ssa_nerfstudio.benchmark.rasterizers import PARAMETERS, draw, relative_error
+from benchmarks.rasterizers import PARAMETERS, draw, relative_error
 from ssa_nerfstudio.rasterization import cpu, reference
 
 every_body = pytest.mark.parametrize("name", BODIES)
@@ -243,8 +243,9 @@ def test_the_radius_clip_drops_the_small_and_keeps_the_large() -> None:
 def test_after_compile_kernels_the_first_frame_compiles_nothing() -> None:
     script = """
 import torch
-from ssa_nerfstudio.benchmark.rasterizers import draw, random_scene
-from ssa_nerfstudio.rasterization import _kernels, _projection_kernels, cpu
+from benchmarks.rasterizers import draw, random_scene
+from ssa_nerfstudio.rasterization import _projection_kernels, cpu
+from ssa_nerfstudio.rasterization import _blending_kernels as _kernels
 kernels = [k for module in (_kernels, _projection_kernels) for k in vars(module).values() if hasattr(k, "signatures")]
 cpu.compile_kernels()
 before = {kernel.py_func.__name__: len(kernel.signatures) for kernel in kernels}

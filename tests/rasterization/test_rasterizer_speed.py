@@ -7,7 +7,7 @@ import time
 import torch
 from rasterization_scenes import BODIES, Scene, scene
 
-from ssa_nerfstudio.benchmark.rasterizers import draw
+from benchmarks.rasterizers import draw
 from ssa_nerfstudio.rasterization.projection import project
 
 

@@ -9,7 +9,7 @@ import torch
 from hard_cases import Case, Family
 
 import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
-from ssa_nerfstudio.plugin.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 
 DENSIFICATION = Family("Densification")
 Params = torch.nn.ParameterDict

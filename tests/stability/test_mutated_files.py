@@ -15,14 +15,14 @@ import yaml
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.benchmark.plan import plan, plan_tradeoff
-from ssa_nerfstudio.benchmark.specification import read_benchmark
-from ssa_nerfstudio.configuration import shipped
-from ssa_nerfstudio.demo.scene import DemoScene
-from ssa_nerfstudio.errors import BadInput
-from ssa_nerfstudio.plugin.inputs import check_transforms
-from ssa_nerfstudio.simulation.dataset import Dataset
-from ssa_nerfstudio.simulation.scene import read_effects, read_scene
+from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.plan import plan, plan_tradeoff
+from ssa_nerfstudio.experiments.configuration import shipped
+from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+from ssa_nerfstudio.experiments.simulation.scene import read_effects, read_scene
+from ssa_nerfstudio.plugin.validation import check_transforms
 
 ODD = [
     None,
@@ -75,11 +75,10 @@ def mutated(content: Any, draw: Callable) -> Any:
     return content
 
 
-def one_line(refused: BadInput, culprit: str = "") -> None:
-    assert refused.code == 2
-    assert refused.message
-    assert culprit in refused.message
-    assert "\n" not in refused.message.strip()
+def one_line(refused: InputError, culprit: str = "") -> None:
+    assert str(refused)
+    assert culprit in str(refused)
+    assert "\n" not in str(refused)
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +98,7 @@ def test_transforms_are_read_or_refused(data, dataset, tmp_path_factory):
     for check in (lambda: check_transforms(folder), lambda: Dataset.read(folder, 8)):
         try:
             check()
-        except BadInput as refused:
+        except InputError as refused:
             one_line(refused)
     shutil.rmtree(folder)
 
@@ -114,7 +113,7 @@ def test_scenes_and_effects_are_read_or_refused(data, tmp_path_factory):
         (folder / path.name).write_text(yaml.safe_dump(mutated(yaml.safe_load(path.read_text()), data.draw)))
         try:
             read(str(folder / path.name))
-        except BadInput as refused:
+        except InputError as refused:
             one_line(refused, path.name)
 
 
@@ -129,7 +128,7 @@ def test_benchmarks_are_planned_or_refused(data, tmp_path_factory):
         plan(benchmark)
         if benchmark.tradeoff is not None:
             plan_tradeoff(benchmark)
-    except BadInput as refused:
+    except InputError as refused:
         one_line(refused)
 
 
@@ -146,6 +145,6 @@ def test_anything_at_all_is_refused(content, name, tmp_path_factory):
         "transforms.json": [lambda: check_transforms(path.parent), lambda: Dataset.read(path.parent, 8)],
     }
     for read in readers[name]:
-        with pytest.raises(BadInput) as caught:
+        with pytest.raises(InputError) as caught:
             read()
         one_line(caught.value)

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from ssa_nerfstudio.benchmark.rasterizers import draw, relative_error
+from benchmarks.rasterizers import draw, relative_error
 from ssa_nerfstudio.rasterization import RasterizerName, cpu, rasterizer, reference
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 

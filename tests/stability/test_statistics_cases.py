@@ -7,9 +7,10 @@ import torch
 from hard_cases import Case, Family
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.detection import detect
+from ssa_nerfstudio.evidence.detection import detect
+from ssa_nerfstudio.evidence.initialization import initialize
+from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.statistics import ImageStatistics, accumulate
 
 STATISTICS = Family("Statistics and start")
 SIZE = (6, 8, 3)
@@ -22,7 +23,7 @@ def photos(views: int, size: tuple[int, int, int] = SIZE, seed: int = 0) -> np.n
 def started(statistics: ImageStatistics, resolution: int = 1) -> ScreenSpaceOverlay:
     """An overlay that starts from the statistics and is usable: finite, its matte in range, its gradients alive."""
     overlay = ScreenSpaceOverlay(*statistics.size, resolution)
-    overlay.start_from(statistics)
+    initialize(overlay, statistics)
     transmittance, addition = overlay.layers()
     (transmittance.sum() + addition.sum()).backward()
     for parameter in overlay.parameters():

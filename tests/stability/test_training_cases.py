@@ -14,10 +14,10 @@ from hard_cases import Case, Family
 from PIL import Image
 from plyfile import PlyData
 
-from ssa_nerfstudio.benchmark.run import configure, train_and_evaluate
-from ssa_nerfstudio.demo.scene import DemoScene
-from ssa_nerfstudio.effects.layers import Layers
-from ssa_nerfstudio.errors import BadInput
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.effects.layers import Layers
+from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
+from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 
 TRAINING = Family("Whole training")
@@ -166,7 +166,7 @@ def _(folder: Path) -> None:
 
 @TRAINING.case("poses all equal", "Normalising the scene divides by the largest distance of a camera, 0.")
 def _(folder: Path) -> None:
-    with pytest.raises(BadInput, match="all cameras are in one place"):
+    with pytest.raises(InputError, match="all cameras are in one place"):
         train(dataset(folder / "scene", edit=transforms(same_pose)))
 
 

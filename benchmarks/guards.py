@@ -1,0 +1,149 @@
+"""What the guards cost: `python benchmarks/guards.py --data DIR`
+
+One training takes every step number twice, with guards and without, in short blocks that take turns: both draw the same
+Gaussians, and a machine that drifts drifts for both. The scene grows first and keeps its Gaussians then. Nothing waits
+for the device between blocks; its own clock tells the times. Prints their ratio with its interval.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import torch
+import tyro
+from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.runs.training_run import configure, versions
+from ssa_nerfstudio.plugin.trainer import SSATrainer
+from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam
+from ssa_nerfstudio.plugin.training.nonfinite import READ_EVERY
+
+
+@dataclass
+class Command:
+    """Measure the guards' cost."""
+
+    data: Path
+    """A nerfstudio dataset."""
+    method: str = "ssa-splatfacto"
+    """One of this plugin's methods."""
+    overlay: str = "on"
+    """on or off."""
+    grow: int = 2_000
+    """Steps of ordinary training before the first block."""
+    pairs: int = 100
+    """So many times as many steps as lie between two looks of the host; the first two warm up."""
+    block: int = 10
+    """Steps before the other takes its turn."""
+    scale_factor: float = 1.0
+    """Photos are resized by this."""
+
+    def run(self) -> None:
+        """Train in turns and print one line."""
+        if READ_EVERY % self.block or self.pairs < 3:
+            raise InputError(f"--block must divide {READ_EVERY} and --pairs be at least 3")
+        with TemporaryDirectory() as folder:
+            training = self._training(Path(folder))
+            for _ in range(self.grow):
+                training.step()
+            times = np.array([self._pair(training, k) for k in range(self.pairs)])[2:]
+        percent = 100 * (times[:, 1] / times[:, 0] - 1)
+        draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
+        low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
+        without = 1e3 * np.median(times[:, 0]) / READ_EVERY
+        gaussians = training.trainer.pipeline.model.num_points
+        print(
+            f"{self.method}, overlay {self.overlay}, {gaussians} Gaussians, {versions()['device']}: {without:.3f} ms a "
+            f"step without guards; with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
+        )
+
+    def _pair(self, training: Training, pair: int) -> list[float]:
+        """Seconds of `READ_EVERY` steps without guards, and of the same with."""
+        laps: dict[bool, list[Lap]] = {False: [], True: []}
+        for block in range(READ_EVERY // self.block):
+            begin = training.steps
+            first = bool((pair + block) % 2)
+            for guarded in (first, not first):
+                training.steps = begin
+                training.switch(guarded)
+                lap = Lap()
+                for _ in range(self.block):
+                    training.step()
+                lap.end()
+                laps[guarded].append(lap)
+        return [sum(lap.seconds() for lap in laps[guarded]) for guarded in (False, True)]
+
+    def _training(self, output: Path) -> Training:
+        model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": self.grow, "mcmc_stop_at": self.grow}
+        steps = self.grow + self.pairs * READ_EVERY
+        config = configure(self.method, self.data, output, steps, model, self.scale_factor)
+        config.scale_schedules = False
+        torch.manual_seed(0)
+        config.set_timestamp()
+        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.pipeline.train()
+        return Training(trainer)
+
+
+class Lap:
+    """A stretch of work between now and `end`, by the device's clock where there is one, else by the host's."""
+
+    def __init__(self) -> None:
+        self._events = [torch.cuda.Event(enable_timing=True) for _ in range(2)] if torch.cuda.is_available() else []
+        self._start = self._mark(0)
+
+    def _mark(self, which: int) -> float:
+        if self._events:
+            self._events[which].record()
+        return time.perf_counter()
+
+    def end(self) -> None:
+        """Until here."""
+        self._seconds = self._mark(1) - self._start
+
+    def seconds(self) -> float:
+        """How long it took; waits for the device."""
+        if not self._events:
+            return self._seconds
+        self._events[1].synchronize()
+        return self._events[0].elapsed_time(self._events[1]) / 1e3
+
+
+class Training:
+    """A training whose guards can be switched off and on as it goes."""
+
+    def __init__(self, trainer: SSATrainer) -> None:
+        self.trainer, self.steps = trainer, 0
+        self._guard = trainer.optimizers.guard
+        self._scalers = {True: trainer.grad_scaler, False: torch.amp.GradScaler(enabled=False)}
+
+    def switch(self, guarded: bool) -> None:
+        """Do as from the start with `guards` in the configuration."""
+        trainer, model = self.trainer, self.trainer.pipeline.model
+        trainer.optimizers.guard = self._guard if guarded else None
+        trainer.grad_scaler = self._scalers[guarded]
+        model.config.guards = model.strategy.guarded = guarded
+        model.info = {}
+        for optimizer in trainer.optimizers.optimizers.values():
+            if isinstance(optimizer, FusedAdam):
+                optimizer.refused = None
+
+    def step(self) -> dict[str, torch.Tensor]:
+        """Train one step, as nerfstudio's loop does: the terms of its loss."""
+        for callback in self.trainer.callbacks:
+            callback.run_callback_at_location(self.steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+        _, losses, _ = self.trainer.train_iteration(self.steps)
+        for callback in self.trainer.callbacks:
+            callback.run_callback_at_location(self.steps, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+        self.steps += 1
+        return losses
+
+
+if __name__ == "__main__":
+    tyro.cli(Command).run()

@@ -1,0 +1,75 @@
+"""What is learned of a real artifact: `python benchmarks/real_artifact.py --data dashcam_hood`.
+
+There are no clean views to compare with, only an approximate mask of the artifact in the raw frame, white where it is.
+The matte is held against it in the undistorted frame, and its mean over the upper third of the frame is told: a sky
+that hardly changes from view to view, and which an overlay must not swallow.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+import tyro
+from PIL import Image
+
+from ssa_nerfstudio.cameras.lens import undistort
+from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.experiments.runs.training_run import configure, model_settings, train_and_evaluate
+from ssa_nerfstudio.metrics.image import matte_iou
+
+MASK = "artifact_mask_approx.png"
+"""The mask's name in the dataset."""
+
+
+def undistorted_mask(data: Path, size: tuple[int, int]) -> torch.Tensor:
+    """The mask of the artifact in the frame that the model sees, [H, W] bool, at its resolution.
+
+    Args:
+        data: dataset that holds `MASK`, with one camera.
+        size: height and width of the undistorted frame as it is trained on.
+    """
+    lens = Dataset.read(data, eval_interval=8).views[0].lens
+    raw = np.asarray(Image.open(data / MASK).convert("L"), np.float32) / 255
+    straight = undistort(np.repeat(raw[..., None], 3, axis=2), lens)[..., 0]
+    return F.interpolate(torch.from_numpy(straight)[None, None], size=size, mode="area")[0, 0] > 0.5
+
+
+@dataclass
+class Command:
+    """Train on a capture with a real artifact, and print one row of figures of the matte."""
+
+    data: Path
+    """A nerfstudio dataset with artifact_mask_approx.png."""
+    method: str = "ssa-splatfacto"
+    """ssa-splatfacto, ssa-splatfacto-mcmc or ssa-splatfacto-paper."""
+    steps: int = 30_000
+    """Training steps; every schedule is scaled to them."""
+    scale_factor: float = 1.0
+    """Photos are resized by this."""
+    settings: tuple[str, ...] = ()
+    """Settings of the model as name=value, for example overlay_start=statistics."""
+
+    def run(self) -> None:
+        """Train and print."""
+        model = model_settings(self.settings)
+        with tempfile.TemporaryDirectory() as scratch:
+            config = configure(self.method, self.data, Path(scratch), self.steps, model, self.scale_factor)
+            outcome, pipeline, _ = train_and_evaluate(config)
+        row = [f"{self.method} {' '.join(self.settings)}".strip(), f"PSNR {outcome.metrics['psnr']:.2f}"]
+        for overlay in pipeline.model.artifacts.learned():
+            matte = overlay.matte().detach().cpu()[..., 0]
+            mask = undistorted_mask(self.data, (len(matte), matte.shape[1]))
+            third = len(matte) // 3
+            rest = matte[third:][~mask[third:]]
+            row += [f"IoU {matte_iou(matte, mask):.3f}", f"upper third {matte[:third].mean():.3f}"]
+            row += [f"artifact {matte[mask].mean():.3f}", f"rest {rest.mean():.3f}"]
+        print("; ".join(row))
+
+
+if __name__ == "__main__":
+    tyro.cli(Command).run()

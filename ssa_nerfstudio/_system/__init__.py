@@ -1,0 +1,1 @@
+"""Locks, child processes and threads: what is neither the field nor the framework."""

@@ -1,0 +1,1 @@
+"""Lenses and the groups of cameras that share an artifact; plain numpy, no nerfstudio."""

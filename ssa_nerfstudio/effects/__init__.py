@@ -1,1 +1,0 @@
-"""The artifact simulator: one module an effect, loaded only when a scene names it."""

@@ -1,0 +1,1 @@
+"""What photos say about a static artifact: statistics, detection, initialization. Plain functions on arrays."""

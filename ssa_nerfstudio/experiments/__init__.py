@@ -1,0 +1,1 @@
+"""Simulated artifacts, the demonstration and the benchmark; needs the extra `experiments`."""

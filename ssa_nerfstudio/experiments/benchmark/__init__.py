@@ -1,0 +1,1 @@
+"""`ssa bench`, `ssa report` and `ssa tradeoff`."""

@@ -1,0 +1,133 @@
+"""The datasets that runs train on, made once and kept: reduced, corrupted, with the true layers beside them."""
+
+from __future__ import annotations
+
+import os
+import re
+import zlib
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from PIL import Image
+
+from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.writing import staged_folder
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import DEMO
+from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN
+from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+from ssa_nerfstudio.experiments.effects.composition import Composition
+from ssa_nerfstudio.experiments.effects.layers import Layers
+from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
+from ssa_nerfstudio.experiments.simulation.simulator import simulate
+
+DEMO_SIZE = {"views": 24, "test_views": 4, "width": 96, "height": 72}
+"""The built-in scene, small enough for minutes on a CPU."""
+
+
+def source(data: str) -> Path:
+    """The folder that a benchmark file means; $SSA_DATA is ./data where it is not set.
+
+    Raises:
+        InputError: it holds no dataset.
+    """
+    environment = {"SSA_DATA": "data", **os.environ}
+    path = Path(os.path.expanduser(_expanded(data, environment)))
+    if data != DEMO and not (path / "transforms.json").is_file():
+        variable = re.search(r"\$\{?(\w+)", data)
+        hint = f" (set {variable[1]} to the folder of captures)" if variable else ""
+        raise InputError(
+            f"{path}/transforms.json does not exist{hint}", "put the capture there, or name other scenes with --scenes"
+        )
+    return path
+
+
+def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> None:
+    """Makes the datasets of runs that are not there yet, each appearing when it is complete.
+
+    Args:
+        runs: what will be trained.
+        folder: where datasets go, by `Run.dataset`.
+        artifacts: where drawn effects are kept, so that a machine without albumentations can use them.
+        threads: photos worked on at once.
+
+    Raises:
+        InputError: a capture is missing or cannot be used.
+    """
+    for run in {run.dataset: run for run in runs}.values():
+        if not (folder / run.dataset).exists():
+            dataset = _clean(run, folder, threads)
+            effects = () if run.real or run.effect == CLEAN else read_effects((run.effect,))
+            scene = KeptScene(effects, run.effect_seed, run.effect, artifacts)
+            simulate(dataset, scene, folder / run.dataset, threads)
+
+
+@dataclass(frozen=True)
+class KeptScene(Scene):
+    """A scene whose drawn artifacts are kept as files; those that vary from view to view are drawn every time."""
+
+    name: str = ""
+    """Of the effect, for the file's."""
+    folder: Path = Path()
+    """Where the files are."""
+
+    def draw(self, height: int, width: int) -> Composition:
+        """The artifact at one frame size, from its file where there is one."""
+        described = zlib.crc32(repr(self.describe()).encode())
+        path = self.folder / f"{self.name}-e{self.seed}-{width}x{height}-{described:08x}.npz"
+        if path.exists():
+            with np.load(path) as arrays:
+                return Composition([Layers(arrays["T"], arrays["B"])])
+        drawn = super().draw(height, width)
+        if drawn.box is None:
+            layers = drawn.whole(None, height, width)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            scratch = path.with_suffix(".part")
+            with scratch.open("wb") as file:
+                np.savez_compressed(file, T=layers.transmittance, B=layers.addition)
+            scratch.rename(path)
+        return drawn
+
+
+def _clean(run: Run, folder: Path, threads: int) -> Dataset:
+    """The capture without anything added, at the run's resolution."""
+    if run.data == DEMO:
+        from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+
+        clean = folder / f"{run.scene}-source"
+        if not clean.exists():
+            DemoScene(**DEMO_SIZE).write(clean, None)
+        return Dataset.read(clean, run.eval_interval)
+    data = source(run.data)
+    if run.downscale == 1:
+        return Dataset.read(data, run.eval_interval)
+    if not (data / f"images_{run.downscale}").is_dir():
+        reduced = folder / f"{run.scene}-source-div{run.downscale}"
+        if not reduced.exists():
+            _reduce(Dataset.read(data, run.eval_interval), run.downscale, reduced)
+        data = reduced
+    return Dataset.read(data, run.eval_interval, run.downscale)
+
+
+def _reduce(dataset: Dataset, factor: int, output: Path) -> None:
+    """A copy with its photos box-filtered into images_N; masks and depth maps are left behind."""
+    with staged_folder(output) as folder:
+        for name in ("transforms.json", *dataset.points):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes((dataset.root / name).read_bytes())
+        (folder / f"images_{factor}").mkdir()
+        for view in dataset.views:
+            with Image.open(dataset.source(view.path)) as photo:
+                size = photo.width // factor, photo.height // factor
+                box = (0, 0, size[0] * factor, size[1] * factor)
+                small = photo.convert("RGB").resize(size, Image.Resampling.BOX, box=box)
+            name = PurePosixPath(view.path).name
+            # PNG's bytes under whatever name transforms.json gives: readers go by content.
+            small.save(folder / f"images_{factor}" / name, format="PNG")
+
+
+def _expanded(text: str, environment: dict[str, str]) -> str:
+    for name, value in sorted(environment.items(), key=lambda item: -len(item[0])):
+        text = text.replace(f"${{{name}}}", value).replace(f"${name}", value)
+    return text

@@ -1,0 +1,154 @@
+"""A benchmark from plan to results: prepare, skip what is done, run the rest, say what is left."""
+
+from __future__ import annotations
+
+import shlex
+import statistics
+import time
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from rich.console import Console
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.execution.cluster_runner import Cluster
+from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
+from ssa_nerfstudio.experiments.benchmark.execution.local_runner import Local
+from ssa_nerfstudio.experiments.benchmark.execution.progress_table import ProgressTable
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
+from ssa_nerfstudio.experiments.benchmark.results import Result, adopt, read_all
+from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+from ssa_nerfstudio.experiments.runs.machine import devices
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to run, apart from what."""
+
+    threads: int
+    """Photos worked on at once while datasets are made."""
+    runs_per_device: int = 1
+    time_limit: float | None = None
+    """Minutes after which no run is at work any more."""
+    scheduler: str | None = None
+    """Address of a dask.distributed scheduler."""
+    keep_models: bool = False
+
+
+def select(runs: list[Run], scenes: tuple[str, ...], only: tuple[str, ...]) -> list[Run]:
+    """The runs of some scenes, whose ids match a pattern.
+
+    Args:
+        scenes: names; empty: all.
+        only: shell patterns for ids; empty: all.
+
+    Raises:
+        InputError: nothing is left.
+    """
+    known = sorted({run.scene for run in runs})
+    for name in scenes:
+        if name not in known:
+            raise InputError(f"--scenes: the benchmark has no scene {name!r}", f"choose from {', '.join(known)}")
+    chosen = [run for run in runs if not scenes or run.scene in scenes]
+    chosen = [run for run in chosen if not only or any(fnmatchcase(run.id, pattern) for pattern in only)]
+    if not chosen:
+        raise InputError(f"--only {' '.join(only)} matches no run", "--list shows their ids")
+    return chosen
+
+
+def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, console: Console) -> list[Run]:
+    """Brings the results folder up to date with the runs.
+
+    Args:
+        runs: in the order of their importance.
+        place: the output folder; `held` by the caller.
+        invocation: `ssa bench NAME` or `ssa tradeoff NAME`, for the commands that results keep.
+        options: how to run.
+        console: progress goes there.
+
+    Returns:
+        The runs that were not done for lack of time.
+    """
+    began = time.monotonic()
+    deadline = None if options.time_limit is None else began + 60 * options.time_limit
+    results, problems = read_all([place.folder])
+    for problem in problems:
+        console.print(f"ignored: {problem}", style="yellow", highlight=False, soft_wrap=True)
+    done = {result.run.id for result in results if result.status != "failed"}
+    missing = [run for run in runs if run.id not in done]
+    known = {result.run.training: result for result in results if result.status != "failed"}
+    names: dict[str, list[Run]] = {}  # of each training, in the order of their importance
+    for run in missing:
+        names.setdefault(run.training, []).append(run)
+    todo = [same[0] for training, same in names.items() if training not in known]
+    prepare(todo, place.scenes, place.artifacts, options.threads)
+
+    def command(run: Run) -> str:
+        return f"{invocation} --output {shlex.quote(str(place.folder))} --only {shlex.quote(run.id)}"
+
+    found = devices()
+    at_once = max(1, len(found)) * options.runs_per_device
+    with ProgressTable(console, len(runs), len(runs) - len(missing), at_once) as table:
+        expected = Expectation(results)
+
+        def ended(run: Run, result: Result | None) -> None:
+            table.ended(run, result)
+            trained = result if result is not None and result.status != "failed" else None
+            if trained is not None:
+                expected.add(trained)
+            for other in names[run.training][1:]:
+                table.ended(other, result if trained is None else adopt(trained, other, place.folder))
+
+        for training, same in names.items():
+            for run in same if training in known else ():
+                table.ended(run, adopt(known[training], run, place.folder))
+        if options.scheduler is not None:
+            cluster = Cluster(place, options.scheduler, options.runs_per_device, command, options.keep_models)
+            left = cluster.work(todo, deadline, table.watch_cluster, ended)
+        else:
+            local = Local(place, found, options.runs_per_device, command, options.keep_models)
+            left = local.work(todo, expected.seconds, deadline, table.watch, ended)
+    return [same for run in left for same in names[run.training]]
+
+
+class Expectation:
+    """How long a run will take, from those that have ended."""
+
+    def __init__(self, results: list[Result]) -> None:
+        """Take what ended before."""
+        self._fixed: dict[str, list[float]] = {}
+        self._per_step: dict[tuple[str, str], list[float]] = {}
+        for result in results:
+            self.add(result)
+
+    def add(self, result: Result) -> None:
+        """Take one more."""
+        if result.status != "finished":
+            return
+        run, training = result.run, result.seconds["training"]
+        self._fixed.setdefault(run.scene, []).append(result.total_seconds - training)
+        self._per_step.setdefault((run.scene, run.densification), []).append(training / run.steps)
+
+    def seconds(self, run: Run) -> float | None:
+        """Seconds that a run will take; None where nothing like it has ended yet.
+
+        Median seconds a step and median of all else, of the same scene and densification, else of the slowest.
+        """
+        if not self._per_step:
+            return None
+        fixed = self._fixed.get(run.scene) or max(self._fixed.values(), key=statistics.median)
+        steps = self._per_step.get((run.scene, run.densification))
+        steps = steps or max(self._per_step.values(), key=statistics.median)
+        return statistics.median(fixed) + run.steps * statistics.median(steps)
+
+
+def reach(folder: Path) -> Workplace:
+    """The workplace of an output folder.
+
+    Raises:
+        InputError: the path is a file.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file", "name a folder with --output")
+    return Workplace(folder)

@@ -1,0 +1,60 @@
+"""The folder of a benchmark: where its datasets, results, pictures, logs and unfinished runs are."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ssa_nerfstudio._system.file_lock import held
+
+
+@dataclass(frozen=True)
+class Workplace:
+    """The output folder of `ssa bench` and `ssa tradeoff`."""
+
+    folder: Path
+
+    @property
+    def scenes(self) -> Path:
+        """Prepared datasets by `Run.dataset`."""
+        return self.folder / "scenes"
+
+    @property
+    def artifacts(self) -> Path:
+        """Drawn effects: all that a machine without albumentations lacks."""
+        return self.folder / "artifacts"
+
+    def result(self, run: str) -> Path:
+        """The JSON of a run."""
+        return self.folder / "results" / f"{run}.json"
+
+    def pictures(self, run: str) -> Path:
+        """Folder of a run's pictures."""
+        return self.folder / "pictures" / run
+
+    def log(self, run: str) -> Path:
+        """What a run printed."""
+        return self.folder / "logs" / f"{run}.log"
+
+    @property
+    def unfinished(self) -> Path:
+        """What interrupted runs leave here means nothing."""
+        return self.folder / "running"
+
+    def running(self, run: str) -> Path:
+        """Where a run works until it has finished."""
+        return self.unfinished / run
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keeps a second benchmark out of the folder, and clears what interrupted runs left.
+
+        Raises:
+            InputError: another process holds it, or it cannot be written.
+        """
+        with held(self.folder, "ssa bench"):
+            shutil.rmtree(self.unfinished, ignore_errors=True)
+            yield

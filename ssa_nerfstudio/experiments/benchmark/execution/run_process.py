@@ -1,0 +1,213 @@
+"""The process of one run, started by `ssa bench` as `python -m ...execution.run_process FOLDER`.
+
+Imports first, and then reads from standard input which run to do: meanwhile another may be at work.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime
+import json
+import shutil
+import sys
+import time
+import traceback
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
+from ssa_nerfstudio.experiments.benchmark.results import Result, write
+from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.plugin.pipeline import SSAPipeline
+    from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
+
+PROGRESS = "progress"
+"""File in a run's folder: what it does, and how many steps are done, in one line."""
+REQUEST = "request.json"
+"""File in a run's folder: what is asked for."""
+OVERLAY_SETTINGS = ("overlay", "sparsity", "ignore_background")
+"""Settings of the model whose names begin so are the overlay's."""
+_SCHEDULED = (
+    "warmup_length",
+    "refine_every",
+    "reset_alpha_every",
+    "resolution_schedule",
+    "sh_degree_interval",
+    "stop_screen_size_at",
+    "stop_split_at",
+    "mcmc_stop_at",
+)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a process is asked to do."""
+
+    run: Run
+    folder: str
+    """The workplace."""
+    runs_per_device: int
+    """How many runs share the device by the user's will."""
+    command: str
+    """What repeats the run."""
+    keep_models: bool = False
+    """Keep nerfstudio's folder with config.yml and checkpoint in `models/`."""
+    flip_processes: int = 1
+    """Processes that compare views by FLIP."""
+    asked: float | None = None
+    """When the process was asked, in seconds since the epoch: what is waited for before the first step begins here.
+    None: as it starts work."""
+
+    def store(self, path: Path) -> None:
+        """Write for the process to read."""
+        path.write_text(json.dumps(dataclasses.asdict(self)), encoding="utf-8")
+
+    @classmethod
+    def load(cls, path: Path) -> Request:
+        """Read in the process."""
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return cls(**{**values, "run": Run.load(values["run"])})
+
+
+def work(request: Request, revision: str) -> Result:
+    """Train, evaluate, score the artifact, take pictures; whatever goes wrong becomes the result's status.
+
+    Args:
+        request: what to do.
+        revision: of the code that does it.
+    """
+    from ssa_nerfstudio.experiments.runs.machine import Company
+
+    company = Company()
+    run, place = request.run, Workplace(Path(request.folder))
+    note = _Progress(place.running(run.id) / PROGRESS)
+    note.stage("loading")
+    result = Result(run, "failed", command=request.command, revision=revision)
+    try:
+        from ssa_nerfstudio.experiments.runs import training_run as training
+        from ssa_nerfstudio.experiments.runs.machine import versions
+
+        result.versions = versions()
+        config = _configuration(run, place)
+        result.schedules = _schedules(config)
+        note.stage("photos")
+        waited = 0.0 if request.asked is None else time.time() - request.asked
+        try:
+            outcome, pipeline, _ = training.train_and_evaluate(
+                config, note.step, run.marks, test_scale=1.0, flip_processes=request.flip_processes
+            )
+        except training.Diverged as error:
+            result.status, result.reason = "diverged", str(error)
+        else:
+            result.metrics, result.views, result.curve = outcome.metrics, outcome.views, outcome.curve
+            result.seconds = {**outcome.seconds, "startup": waited + outcome.seconds["startup"]}
+            result.gaussians, result.peak_memory_mb = outcome.gaussians, outcome.peak_memory_mb
+            note.stage("pictures")
+            result.artifact = _artifact(run, pipeline, place)
+            from ssa_nerfstudio.experiments.benchmark.execution.view_pictures import take
+
+            take(pipeline, place.pictures(run.id))
+            result.status = "finished"
+        if request.keep_models:
+            shutil.move(place.running(run.id) / "nerfstudio", place.folder / "models" / run.id)
+    except Exception as error:
+        traceback.print_exc()
+        result.reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+    result.alone = request.runs_per_device == 1 and company.alone()
+    result.company = {"runs_per_device": request.runs_per_device, "others_share_of_cores": company.share_of_cores()}
+    result.ended = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    return result
+
+
+def _configuration(run: Run, place: Workplace) -> SSATrainerConfig:
+    """nerfstudio's configuration of a run."""
+    from ssa_nerfstudio.experiments.runs import training_run as training
+
+    data = place.scenes / run.dataset
+    model: dict[str, Any] = {}
+    if run.shipped_overlay:
+        shipped = training.METHODS["ssa-splatfacto"].pipeline.model
+        model = {name: value for name, value in vars(shipped).items() if name.startswith(OVERLAY_SETTINGS)}
+    model |= run.model
+    if model.get("overlay") == "given":
+        model["overlay_given"] = data / "layers" / "undistorted.npz"
+    config = training.configure(
+        run.nerfstudio_method,
+        data,
+        place.running(run.id) / "nerfstudio",
+        run.steps,
+        model,
+        run.image_scale,
+        run.seed,
+    )
+    config.pipeline.datamanager.dataparser.downscale_factor = 1  # pyright: ignore[reportAttributeAccessIssue]
+    return config
+
+
+def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
+    """The schedules that a run really follows, in steps, and the overlay's learning rate."""
+    from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH, scaled
+
+    final = scaled(config) if config.scale_schedules else config
+    values = {name: getattr(final.pipeline.model, name) for name in _SCHEDULED}
+    for name, entry in final.optimizers.items():
+        if entry["scheduler"] is not None:
+            values[f"learning_rate_{name}"] = entry["scheduler"].max_steps
+    values["overlay_learning_rate"] = final.optimizers["overlay"]["optimizer"].lr
+    return {"factor": config.max_num_iterations / FULL_LENGTH, **values}
+
+
+def _artifact(run: Run, pipeline: SSAPipeline, place: Workplace) -> dict[str, float]:
+    """Scores of the learned overlays, mean over cameras; empty where none was learned or no truth is known."""
+    truth = place.scenes / run.dataset / "layers" / "undistorted.npz"
+    learned = pipeline.model.artifacts.learned()
+    if not learned or not truth.exists():
+        return {}
+    from ssa_nerfstudio.experiments.benchmark.execution.artifact_scores import score, true_layers
+
+    scores = [score(overlay, *true_layers(truth, g, len(learned))) for g, overlay in enumerate(learned)]
+    return {name: sum(values[name] for values in scores) / len(scores) for name in scores[0]}
+
+
+class _Progress:
+    """Tells the parent, by a file, what is being done; at most five times a second."""
+
+    def __init__(self, path: Path) -> None:
+        self._path, self._written = path, 0.0
+
+    def stage(self, name: str) -> None:
+        """A stage begins."""
+        with contextlib.suppress(OSError):
+            self._path.write_text(f"{name} 0")
+
+    def step(self, done: int) -> None:
+        """That many steps are done."""
+        if time.monotonic() - self._written > 0.2:
+            self._written = time.monotonic()
+            with contextlib.suppress(OSError):
+                self._path.write_text(f"training {done}")
+
+
+def main(place: Workplace) -> int:
+    """Do the run that is asked for; 0 where a result was reached or nothing asked, 1 where the run failed."""
+    end_with_parent()
+    with contextlib.suppress(Exception):  # where it is needed, and the run's result can say so, it fails again
+        import ssa_nerfstudio.experiments.runs.training_run  # noqa: F401
+    from ssa_nerfstudio.experiments.runs.machine import revision
+
+    imported = revision()
+    run = sys.stdin.readline().strip()
+    if not run:
+        return 0
+    result = work(Request.load(place.running(run) / REQUEST), imported)
+    write(result, place.result(run))
+    return 1 if result.status == "failed" else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Workplace(Path(sys.argv[1]))))

@@ -1,0 +1,146 @@
+"""`ssa report`: results folders in, one report as HTML and Markdown out."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections import Counter
+from pathlib import Path
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.report import tables
+from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
+from ssa_nerfstudio.experiments.benchmark.report.picture_sheets import sheet
+from ssa_nerfstudio.experiments.benchmark.report.study import CLEAN, Study, studies
+from ssa_nerfstudio.experiments.benchmark.results import Result, absence, read_all
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+
+PLANS = "plans"
+"""Folder beside the results: what was asked for."""
+
+
+def store_plan(folder: Path, command: str, benchmark: Benchmark, runs: list[Run]) -> None:
+    """Notes beside the results which runs were planned, so that a report can say what is missing."""
+    path = folder / PLANS / f"{command}-{benchmark.name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = {"benchmark": benchmark.name, "protocol": benchmark.protocol, "runs": [run.id for run in runs]}
+    path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+
+
+def report(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
+    """Writes report.md and report.html, with sheets beside them.
+
+    Args:
+        folders: of `ssa bench`; of a run that several hold, one is taken.
+        output: folder of the report.
+
+    Returns:
+        The files, and a line for every file that was ignored.
+
+    Raises:
+        InputError: there is no result at all.
+    """
+    for folder in folders:
+        if not (folder / "results").is_dir():
+            raise InputError(f"{folder} holds no results", "name the --output folder of ssa bench")
+    results, problems = read_all(folders)
+    if not any(result.status != "failed" and not result.run.marks for result in results):
+        raise InputError(f"{folders[0]}/results holds no result of ssa bench that ended", "run ssa bench first")
+    planned, protocols = _plans(folders)
+    sections = [_overview(results, planned, problems, folders)]
+    for study in studies(results):
+        sections.append(_section(study, protocols == {"paper"} and study.steps == 30_000))
+        pictures = _sheets(study, folders, output)
+        if pictures:
+            sections.append(Section(f"Pictures, {study.title}", contents=list(pictures)))
+    return Document("What the overlay restores", sections).write(output, "report"), problems
+
+
+def _plans(folders: list[Path]) -> tuple[set[str], set[str]]:
+    runs: set[str] = set()
+    protocols: set[str] = set()
+    for folder in folders:
+        for path in sorted((folder / PLANS).glob("bench-*.json")):
+            try:
+                values = json.loads(path.read_text(encoding="utf-8"))
+                runs |= set(values["runs"])
+                protocols.add(values["protocol"])
+            except (OSError, ValueError, KeyError, TypeError):
+                continue  # only what is missing is then not known
+    return runs, protocols
+
+
+def _overview(results: list[Result], planned: set[str], problems: list[str], folders: list[Path]) -> Section:
+    results = [result for result in results if not result.run.marks]
+    counts = Counter(result.status for result in results)
+    text = [
+        f"Made by `ssa report {' '.join(shlex.quote(str(folder)) for folder in folders)}` from {len(results)} runs: "
+        f"{counts['finished']} finished, {counts['diverged']} diverged (†, left out of means), {counts['failed']} "
+        f"failed; {absence(results, planned)}. Every run's JSON holds its command.",
+        "PSNR, SSIM (valid padding), FLIP and mean colour deviation (0 to 255) compare the *clean* render with "
+        "clean test views that no training saw.",
+    ]
+    made = Counter(
+        (r.versions.get("device", "?"), r.versions.get("torch", "?"), r.versions.get("gsplat", "?"), r.revision)
+        for r in results
+    )
+    rows = [[*key, str(count)] for key, count in made.most_common()]
+    contents: list[Table | Picture] = [Table("Made on", ["device", "torch", "gsplat", "revision", "runs"], rows)]
+    if len({key[3] for key in made}) > 1:
+        text.append("**Runs of several revisions of the code are mixed here.**")
+    shared = sum(bool(r.same_as) for r in results)
+    if shared:
+        text.append(f"{shared} of them are the trainings of others under another method's name, and were not repeated.")
+    troubles = [[r.run.id, r.status, r.reason] for r in results if r.status != "finished"]
+    if troubles:
+        contents.append(Table("Runs that did not finish", ["run", "", "why"], troubles))
+    if problems:
+        contents.append(Table("Files that were ignored", ["file and reason"], [[line] for line in problems]))
+    return Section("What this is made of", text, contents)
+
+
+def _section(study: Study, with_paper: bool) -> Section:
+    drawn = [
+        tables.results_by_category(study, with_paper),
+        tables.results_by_scene(study),
+        tables.sensitivity(study, with_paper),
+        tables.ablation(study, with_paper),
+        tables.bar(study),
+        tables.paired(study, "default"),
+        tables.paired(study, "overlay-on") if "default" not in study.methods else None,
+        tables.artifact_itself(study),
+        tables.cost(study),
+    ]
+    seeds = sorted({result.run.seed for result in study.results})
+    text = [f"Schedules scaled by {study.steps} / 30000; seeds {', '.join(map(str, seeds))}."]
+    if len(seeds) < 2:
+        text.append("One seed: differences below about 0.3 dB are noise until they have been repeated.")
+    if with_paper:
+        text.append("The paper's protocol: its figures stand below ours. gsplat's own clean ADC reference is 28.95.")
+    return Section(study.title, text, [table for table in drawn if table is not None])
+
+
+def _sheets(study: Study, folders: list[Path], output: Path) -> list[Picture]:
+    """A sheet for every scene and artifact: the first seed of every method, ADC where it was run."""
+    pictures = []
+    for effect, scene in [*study.pairs, *((CLEAN, scene) for scene in study.scenes)]:
+        for densification in study.densifications:
+            columns = []
+            for method in study.methods:
+                chosen = [r for r in study.select(effect, scene, method, densification) if r.status == "finished"]
+                if chosen:
+                    columns.append((chosen[0], _pictures(chosen[0], folders)))
+            drawn = sheet(columns) if columns else None
+            if drawn is not None:
+                name = f"{scene}-{effect}-{densification}-{study.steps}-e{study.effect_seed}.jpg"
+                (output / "sheets").mkdir(parents=True, exist_ok=True)
+                drawn.save(output / "sheets" / name, quality=88)
+                caption = f"{scene}, {effect}, {densification.upper()}, {study.title}"
+                pictures.append(Picture(output / "sheets" / name, caption))
+    return pictures
+
+
+def _pictures(result: Result, folders: list[Path]) -> Path:
+    found = [folder / "pictures" / result.run.id for folder in folders]
+    return next((path for path in found if path.is_dir()), found[0])

@@ -1,0 +1,201 @@
+"""One JSON a run: written at once, checked when read; a file that is no result is named and left aside."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+
+FORMAT = "ssa-nerfstudio benchmark run"
+"""Marks a file as one of ours."""
+VERSION = 1
+Status = Literal["finished", "diverged", "failed"]
+
+
+@dataclass
+class Result:
+    """What one run gave: the JSON's contents."""
+
+    run: Run
+    status: Status
+    """finished; diverged: nothing to evaluate was left; failed: it ended in an error and will be tried again."""
+    reason: str = ""
+    """Of a run that did not finish."""
+    metrics: dict[str, float] = field(default_factory=dict)
+    """Means over the test views: psnr (dB), ssim ("valid" padding), flip, mean_colour_deviation (0..255), ..."""
+    views: dict[str, dict[str, float]] = field(default_factory=dict)
+    """The same of each test view by its file's name."""
+    artifact: dict[str, float] = field(default_factory=dict)
+    """The learned overlay against the true layers (`artifact_scores.score`), mean over cameras."""
+    curve: list[dict[str, float]] = field(default_factory=list)
+    """Metrics along the run: step, seconds, gaussians, metrics."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """startup, statistics, training, evaluation; startup counts from when the run was asked for."""
+    alone: bool = False
+    """Whether the run had its device to itself."""
+    company: dict[str, float] = field(default_factory=dict)
+    """runs_per_device, and the share of all cores that other processes used meanwhile."""
+    gaussians: int = 0
+    peak_memory_mb: float = 0.0
+    """Largest memory that torch held on the GPU while training; on a CPU that of the process."""
+    schedules: dict[str, Any] = field(default_factory=dict)
+    """The schedules as they were scaled, in steps."""
+    versions: dict[str, str] = field(default_factory=dict)
+    """Packages, Python and the device."""
+    revision: str = ""
+    """git revision of the code; + where files differed from it."""
+    command: str = ""
+    """What repeats this run, or the one that it is the same as."""
+    same_as: str = ""
+    """Id of the run that was trained, where this one is the same training under another method's name."""
+    ended: str = ""
+    """When, UTC, ISO 8601."""
+
+    @property
+    def total_seconds(self) -> float:
+        """From when the run was asked for to its end."""
+        return sum(self.seconds.values())
+
+
+def write(result: Result, path: Path) -> None:
+    """Writes a result; the file appears when it is complete."""
+    values = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(result)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+    # JSON has no infinity: the PSNR of equal pictures becomes null.
+    scratch.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    scratch.replace(path)
+
+
+def read(path: Path) -> Result:
+    """One result.
+
+    Raises:
+        InputError: the file cannot be read, is truncated, or is something else.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({error})") from error
+    except ValueError as error:
+        raise InputError(f"{path} is no whole JSON ({error}): truncated?") from error
+    if not isinstance(values, dict) or values.get("format") != FORMAT:
+        raise InputError(f"{path} is not a result of ssa bench")
+    if values.get("version") != VERSION:
+        raise InputError(f"{path} is of version {values.get('version')!r}, this reads version {VERSION}")
+    try:
+        known = {f.name for f in dataclasses.fields(Result)} - {"run"}
+        result = Result(run=Run.load(values["run"]), **{name: value for name, value in values.items() if name in known})
+        _check(result)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{path} lacks what a result holds ({type(error).__name__}: {error})") from error
+    if result.run.id != path.stem:
+        raise InputError(f"{path} holds the run {result.run.id}: renamed, or edited")
+    return result
+
+
+def read_all(folders: list[Path]) -> tuple[list[Result], list[str]]:
+    """The results of several folders of `ssa bench`, each run once: the first that finished, else the last seen.
+
+    Returns:
+        Results in the order of their files, and a line for every file that is none.
+    """
+    found: dict[str, Result] = {}
+    problems = []
+    for folder in folders:
+        for path in sorted((folder / "results").glob("*.json")):
+            try:
+                result = read(path)
+            except InputError as problem:
+                problems.append(str(problem))
+                continue
+            if result.run.id not in found or found[result.run.id].status == "failed":
+                found[result.run.id] = result
+    return list(found.values()), problems
+
+
+def absence(results: list[Result], planned: set[str]) -> str:
+    """A clause for a report: how many of the planned runs have no result, and which.
+
+    Args:
+        results: what there is.
+        planned: ids; empty where that is not known.
+    """
+    if not planned:
+        return "what was planned is not noted beside the results, so that missing ones are not known"
+    missing = planned - {result.run.id for result in results}
+    named = f": {', '.join(f'`{run}`' for run in sorted(missing))}" if missing else ""
+    return f"{len(missing)} of {len(planned)} planned ones are missing{named}"
+
+
+def merge(source: Path, target: Path) -> int:
+    """Copies the results that another folder has and this one has not, with their pictures and logs.
+
+    Returns:
+        How many were copied.
+    """
+    present = {result.run.id: result for result in read_all([target])[0]}
+    copied = 0
+    for result in read_all([source])[0]:
+        run = result.run.id
+        if run in present and (present[run].status != "failed" or result.status == "failed"):
+            continue
+        _copy_companions(source, run, target, run)
+        write(result, target / "results" / f"{run}.json")
+        copied += 1
+    return copied
+
+
+def adopt(result: Result, run: Run, folder: Path) -> Result:
+    """Writes a result, with pictures and log, for another run of the same training.
+
+    Returns:
+        What was written.
+    """
+    _copy_companions(folder, result.run.id, folder, run.id)
+    adopted = dataclasses.replace(result, run=run, same_as=result.same_as or result.run.id)
+    write(adopted, folder / "results" / f"{run.id}.json")
+    return adopted
+
+
+def _copy_companions(source: Path, run: str, target: Path, name: str) -> None:
+    """Pictures and log of a run to another folder, or under another name."""
+    for kind, suffix in (("pictures", ""), ("logs", ".log")):
+        origin, goal = source / kind / f"{run}{suffix}", target / kind / f"{name}{suffix}"
+        if origin.is_dir():
+            shutil.copytree(origin, goal, dirs_exist_ok=True)
+        elif origin.exists():
+            goal.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(origin, goal)
+
+
+def _check(result: Result) -> None:
+    """Types and values that everything behind relies on."""
+    if result.status not in ("finished", "diverged", "failed"):
+        raise ValueError(f"status {result.status!r}")
+    numbers = [*result.seconds.values(), *(n for view in result.views.values() for n in view.values())]
+    numbers += [n for point in result.curve for n in point.values()]
+    if not all(isinstance(n, (int, float)) or n is None for n in [*numbers, *result.metrics.values()]):
+        raise ValueError("a metric is no number")
+    if result.status == "finished" and not {"psnr", "ssim", "flip"} <= result.metrics.keys():
+        raise ValueError("a finished run without psnr, ssim and flip")
+    if result.status == "finished" and not {"startup", "statistics", "training", "evaluation"} <= result.seconds.keys():
+        raise ValueError("a finished run without its seconds")
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,1 @@
+"""What a benchmark file states, and the runs that follow from it."""

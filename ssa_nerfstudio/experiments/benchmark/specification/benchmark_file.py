@@ -1,0 +1,199 @@
+"""What a benchmark file states: scenes, the parts of the matrix in their order, and the knobs of a tradeoff."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import METHODS
+from ssa_nerfstudio.experiments.configuration import build, locate, read
+
+Densification = Literal["adc", "mcmc"]
+DEMO = "demo"
+"""The `data` of a scene that stands for the built-in one."""
+_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.")
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """A capture.
+
+    Raises:
+        ValueError: a field is out of its range.
+    """
+
+    data: str
+    """Folder of a nerfstudio dataset, $SSA_DATA and other environment variables are expanded; `demo`: built in."""
+    name: str | None = None
+    """As tables call it: letters, digits, _ and dots; the folder's name where not given."""
+    downscale: int = 1
+    """Photos are taken from images_N, or reduced by this whole number where there is no such folder."""
+    eval_interval: int = 8
+    """Every so many photos one tests, where transforms.json states no split."""
+    artifact: str | None = None
+    """What its training photos carry already (finger, mud, occlusion): then no effect is put in front of them."""
+    cap_max: int | None = None
+    """Largest number of Gaussians under MCMC; the method's own where not given."""
+    model: dict = field(default_factory=dict)
+    """Settings of the model for this scene."""
+
+    def __post_init__(self) -> None:
+        if self.downscale < 1 or self.eval_interval < 2:
+            raise ValueError(f"{self.title}: downscale must be at least 1 and eval_interval at least 2")
+        if not self.title or not set(self.title) <= _NAME_CHARACTERS:
+            raise ValueError(f"scene name {self.title!r} must consist of letters, digits, _ and dots; state one: name")
+
+    @property
+    def title(self) -> str:
+        """Its name in tables and file names."""
+        return self.name or self.data.rstrip("/").rsplit("/", 1)[-1]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A product of scenes, effects, methods, densifications and seeds; parts are run in their order.
+
+    Raises:
+        ValueError: a field is out of its range.
+    """
+
+    methods: tuple[str, ...]
+    """Rows of the matrix (`benchmark.matrix.METHODS`), or candidates of the file."""
+    effects: tuple[str, ...] = ("none",)
+    """Effects of `ssa simulate`, and `none`: clean photos. Of scenes that carry an artifact already, ignored."""
+    scenes: tuple[str, ...] | None = None
+    """Names of scenes; all where not given."""
+    densification: tuple[Densification, ...] = ("adc",)
+    """adc, mcmc."""
+    seeds: tuple[int, ...] = (0,)
+    """Of the training: order of the views, densification."""
+    effect_seed: int = 0
+    """Of the effects: where drops fall."""
+    steps: int = 7000
+    """Training steps; schedules are scaled by steps / 30000."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.effect_seed < 0 or any(seed < 0 for seed in self.seeds):
+            raise ValueError("steps must be at least 1, seeds must not be negative")
+
+
+@dataclass(frozen=True)
+class Tradeoff:
+    """What `ssa tradeoff` varies: one knob at a time around a base, and a few together.
+
+    Raises:
+        ValueError: a field is out of its range.
+    """
+
+    scenes: tuple[str, ...]
+    """Names of scenes of the file."""
+    effect: str = "dashboard"
+    """What is put in front of them."""
+    knobs: dict = field(default_factory=dict)
+    """Knob to its settings: steps, image_scale, densification, or any setting of the model."""
+    together: tuple[Any, ...] = ()
+    """Mappings from knob to setting, each one run."""
+    base: dict = field(default_factory=dict)
+    """Settings that all runs share unless they vary them."""
+    steps: int = 7000
+    """Steps of the base."""
+    seeds: tuple[int, ...] = (0,)
+    """Of the training."""
+    marks: int = 8
+    """Evaluations along each run, from 1 / 16 of its steps to its end, evenly in the logarithm."""
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.marks < 1:
+            raise ValueError("steps and marks must be at least 1")
+        for name, settings in self.knobs.items():
+            if not isinstance(settings, list) or not settings:
+                raise ValueError(f"knobs.{name} must be a list of settings, got {settings!r}")
+        for number, variation in enumerate(self.together):
+            if not isinstance(variation, dict) or not variation:
+                raise ValueError(f"together[{number}] must be keys and values, got {variation!r}")
+        single = [{name: setting} for name, settings in self.knobs.items() for setting in settings]
+        for settings in (self.base, *single, *self.together):
+            _check_knobs(settings)
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """A benchmark file.
+
+    Raises:
+        ValueError: a part or tradeoff names something unknown, or two scenes have one name.
+    """
+
+    scenes: tuple[SceneEntry, ...]
+    """Captures."""
+    parts: tuple[Part, ...] = ()
+    """The matrix, most important first."""
+    method: str = "ssa-splatfacto"
+    """nerfstudio method that every row starts from: ssa-splatfacto, or ssa-splatfacto-paper."""
+    protocol: Literal["own", "paper"] = "own"
+    """paper: data, splits, resolutions, caps and schedules are the paper's, so its figures stand beside ours."""
+    model: dict = field(default_factory=dict)
+    """Settings of the model for all runs."""
+    candidates: dict = field(default_factory=dict)
+    """More methods: name to settings that replace the default's, with the overlay on."""
+    tradeoff: Tradeoff | None = None
+    """What `ssa tradeoff` does with this file."""
+    name: str = ""
+    """Of the benchmark; the file's where not given."""
+
+    def __post_init__(self) -> None:
+        names = [scene.title for scene in self.scenes]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"scenes need names of their own, and at least one is needed; got {names}")
+        for settings in (self.model, *(scene.model for scene in self.scenes)):
+            _check_names(settings, "a setting of the model")
+        known = [*METHODS, *self.candidates]
+        for name in self.candidates:
+            if name in METHODS or not isinstance(self.candidates[name], dict):
+                raise ValueError(f"candidate {name!r} must be keys and values under a name that no method has")
+            _check_names(self.candidates[name], f"a setting of candidate {name!r}")
+        _check_names(self.candidates, "a candidate")
+        for part in self.parts:
+            _require(part.methods, known, "method")
+            _require(part.scenes or (), names, "scene")
+        if self.tradeoff is not None:
+            _require(self.tradeoff.scenes, names, "scene")
+
+    def scene(self, name: str) -> SceneEntry:
+        """A capture by name."""
+        return next(scene for scene in self.scenes if scene.title == name)
+
+
+def read_benchmark(name: str) -> Benchmark:
+    """A benchmark from a shipped name or a .yaml file.
+
+    Raises:
+        InputError: it cannot be found or is faulty.
+    """
+    path = locate("benchmarks", name)
+    values = read(path)
+    return build(Benchmark, {"name": path.stem, **values}, str(path))
+
+
+def _check_knobs(settings: dict[Any, Any]) -> None:
+    """Knobs that are no setting of the model, which checks its own."""
+    _check_names(settings, "a knob")
+    steps, scale = settings.get("steps", 1), settings.get("image_scale", 1.0)
+    if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
+        raise ValueError(f"steps must be whole numbers from 1 on, got {steps!r}")
+    if not isinstance(scale, (int, float)) or isinstance(scale, bool) or not 0 < scale <= 1:
+        raise ValueError(f"image_scale must be above 0 and at most 1, got {scale!r}")
+    if settings.get("densification", "adc") not in ("adc", "mcmc"):
+        raise ValueError(f"densification must be adc or mcmc, got {settings['densification']!r}")
+
+
+def _check_names(settings: dict[Any, Any], what: str) -> None:
+    for name in settings:
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"{what} must have a name, got {name!r}")
+
+
+def _require(names: tuple[str, ...], known: list[str], what: str) -> None:
+    for name in names:
+        if name not in known:
+            raise ValueError(f"there is no {what} {name!r}; it has {', '.join(known)}")

@@ -1,0 +1,188 @@
+"""From a benchmark to its runs: pure data. A run has everything that decides its outcome, and an id made of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from dataclasses import dataclass, field
+from typing import Any
+
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark, SceneEntry
+from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, paper_weight
+
+RUN_KNOBS = ("steps", "image_scale", "densification")
+"""What a tradeoff can vary beside settings of the model."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training and its evaluation."""
+
+    scene: str
+    """Name of the capture."""
+    data: str
+    """Its dataset as the benchmark file states it."""
+    downscale: int
+    eval_interval: int
+    effect: str
+    """What is in front of the training photos; `none`: nothing."""
+    effect_seed: int
+    real: bool
+    """The photos carry the artifact themselves: nothing is simulated, and no true layers are known."""
+    method: str
+    """Row of the matrix."""
+    densification: str
+    """adc or mcmc."""
+    seed: int
+    steps: int
+    nerfstudio_method: str
+    """Method whose configuration the run starts from."""
+    shipped_overlay: bool
+    """Overlay settings are taken from `ssa-splatfacto` before `model` is applied."""
+    model: dict[str, Any]
+    """Settings of the model by field name."""
+    image_scale: float = 1.0
+    """Training photos are resized by this; test photos are not."""
+    marks: tuple[int, ...] = ()
+    """Steps after which the test views are evaluated, besides the end; increasing."""
+    variation: dict[str, Any] = field(default_factory=dict)
+    """Knobs that a tradeoff set for this run."""
+
+    @classmethod
+    def load(cls, values: dict[str, Any]) -> Run:
+        """From what JSON makes of a run.
+
+        Raises:
+            TypeError, KeyError: a value is missing, or one is too many.
+        """
+        return cls(**{**values, "marks": tuple(values["marks"])})
+
+    def value(self, knob: str) -> Any:
+        """What it sets a tradeoff's knob to, varied or not; None: whatever the method's default is."""
+        return getattr(self, knob) if knob in RUN_KNOBS else self.model.get(knob)
+
+    @property
+    def id(self) -> str:
+        """A name for people and files; equal for equal runs, on every machine."""
+        values = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
+        digest = hashlib.sha256(values.encode()).hexdigest()[:8]
+        parts = [self.scene, self.effect, self.method, self.densification, str(self.steps), f"s{self.seed}"]
+        return "-".join([*parts, *(f"{k}={v}" for k, v in self.variation.items() if k not in RUN_KNOBS), digest])
+
+    @property
+    def training(self) -> str:
+        """Equal for runs that differ in nothing but the name of their method: one training answers for all of them."""
+        return dataclasses.replace(self, method="").id
+
+    @property
+    def dataset(self) -> str:
+        """Name of the folder of its prepared dataset; runs that share it train on the same photos."""
+        seed = f"-e{self.effect_seed}" if self.effect_seed else ""
+        reduced = f"-div{self.downscale}" if self.downscale > 1 else ""
+        return f"{self.scene}-{'captured' if self.real else self.effect}{seed}{reduced}"
+
+
+def plan(benchmark: Benchmark) -> list[Run]:
+    """The runs of all parts in their order, each once.
+
+    Left out is what means nothing: the true overlay of clean photos, and of real artifacts, which nobody knows.
+    """
+    runs: dict[str, Run] = {}
+    for part in benchmark.parts:
+        for densification in part.densification:
+            for seed in part.seeds:
+                for name in part.scenes or [scene.title for scene in benchmark.scenes]:
+                    scene = benchmark.scene(name)
+                    for effect in part.effects if scene.artifact is None else (scene.artifact,):
+                        for method in part.methods:
+                            if method == "given" and (scene.artifact is not None or effect == CLEAN):
+                                continue
+                            run = _run(benchmark, scene, effect, method, densification, part.steps)
+                            # Nothing decides where nothing is drawn.
+                            drawn = 0 if effect == CLEAN or run.real else part.effect_seed
+                            run = dataclasses.replace(run, seed=seed, effect_seed=drawn)
+                            runs.setdefault(run.id, run)
+    return list(runs.values())
+
+
+def plan_tradeoff(benchmark: Benchmark) -> list[Run]:
+    """The base, one knob at a time, and a few together, for every scene and seed of the file's tradeoff, each once.
+
+    Raises:
+        ValueError: the file has no tradeoff.
+    """
+    tradeoff = benchmark.tradeoff
+    if tradeoff is None:
+        raise ValueError(f"{benchmark.name} states no tradeoff")
+    single = [{knob: setting} for knob, settings in tradeoff.knobs.items() for setting in settings]
+    runs: dict[str, Run] = {}
+    for name in tradeoff.scenes:
+        scene = benchmark.scene(name)
+        effect = tradeoff.effect if scene.artifact is None else scene.artifact
+        for seed in tradeoff.seeds:
+            base = _varied(benchmark, scene, effect, seed, {})
+            for variation in ({}, *single, *tradeoff.together):
+                run = _varied(benchmark, scene, effect, seed, variation)
+                # A knob at its base setting is the base once more.
+                if dataclasses.replace(run, variation={}) == base:
+                    run = base
+                runs.setdefault(run.id, run)
+    return list(runs.values())
+
+
+def marks(steps: int, count: int) -> tuple[int, ...]:
+    """Steps at which a run is evaluated: `count` of them from steps / 16 to the end, evenly in the logarithm."""
+    if count == 1:
+        return (steps,)
+    return tuple(sorted({max(1, round(steps * 16 ** (k / (count - 1) - 1))) for k in range(count)}))
+
+
+def _varied(benchmark: Benchmark, scene: SceneEntry, effect: str, seed: int, variation: dict[str, Any]) -> Run:
+    """The default method with the base's and the variation's knobs set."""
+    tradeoff = benchmark.tradeoff
+    assert tradeoff is not None
+    knobs = {"steps": tradeoff.steps, "image_scale": 1.0, "densification": "adc", **tradeoff.base, **variation}
+    steps, scale, densification = (knobs.pop(name) for name in RUN_KNOBS)
+    run = _run(benchmark, scene, effect, "overlay-on", densification, int(steps))
+    return dataclasses.replace(
+        run,
+        seed=seed,
+        model={**run.model, **knobs},
+        image_scale=float(scale),
+        marks=marks(int(steps), tradeoff.marks),
+        variation=dict(variation),
+    )
+
+
+def _run(benchmark: Benchmark, scene: SceneEntry, effect: str, method: str, densification: str, steps: int) -> Run:
+    real = scene.artifact is not None
+    row = METHODS.get(method, METHODS["overlay-on"])
+    model: dict[str, Any] = {**benchmark.model, **scene.model, "strategy": densification, **row.model}
+    if scene.cap_max is not None and densification == "mcmc":
+        model["cap_max"] = scene.cap_max
+    if row.weight_by_category:
+        model["sparsity_weight"] = paper_weight(effect, real)
+    model |= benchmark.candidates.get(method, {})
+    model = {name: _switch(value) if name == "overlay" else value for name, value in model.items()}
+    return Run(
+        scene=scene.title,
+        data=scene.data,
+        downscale=scene.downscale,
+        eval_interval=scene.eval_interval,
+        effect=effect,
+        effect_seed=0,
+        real=real,
+        method=method,
+        densification=densification,
+        seed=0,
+        steps=steps,
+        nerfstudio_method=benchmark.method,
+        shipped_overlay=row.shipped_overlay,
+        model=model,
+    )
+
+
+def _switch(value: Any) -> Any:
+    """YAML reads on and off as booleans."""
+    return {True: "on", False: "off"}[value] if isinstance(value, bool) else value

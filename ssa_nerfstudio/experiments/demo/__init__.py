@@ -1,0 +1,1 @@
+"""`ssa demo`: the same model with and without the overlay."""

@@ -1,0 +1,1 @@
+"""One module per simulated artifact, imported when a scene names it."""

@@ -1,0 +1,98 @@
+"""Several effects in front of one another: I = clip(T2 (T1 C + B1) + B2, 0, 1), clipped once, at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import reduce
+
+import numpy as np
+
+from ssa_nerfstudio.experiments.effects.layers import Box, Layers, VaryingLayers
+
+
+class Composition:
+    """Effects of one frame, the first nearest to the scene and the last nearest to the eye.
+
+    What is the same in every view is composed once; only the rectangle around the effects that vary is composed again
+    for a view.
+    """
+
+    def __init__(self, parts: Sequence[Layers | VaryingLayers]) -> None:
+        """Take the effects' layers, all of one frame size.
+
+        Args:
+            parts: at least one.
+        """
+        self.parts = list(parts)
+        self._varying = [part for part in self.parts if isinstance(part, VaryingLayers)]
+        self.box: Box | None = _bounding_box([part.box for part in self._varying]) if self._varying else None
+        """Rectangle in which views differ; None where none does."""
+        still = [part for part in self.parts if isinstance(part, Layers)]
+        self.static: Layers | None = reduce(Layers.behind, still) if still else None
+        """The layers outside `box`; None where nothing covers it."""
+
+    def view(self, generators: Sequence[np.random.Generator]) -> Layers:
+        """One view's layers inside `box`, rounded to float16 so that they can be stored as such, exactly.
+
+        Args:
+            generators: one for each effect that varies, in their order.
+
+        Raises:
+            ValueError: no effect varies.
+        """
+        if self.box is None:
+            raise ValueError("no effect varies from view to view")
+        draw = iter(generators)
+        inside = reduce(
+            Layers.behind,
+            (
+                part.crop(self.box) if isinstance(part, Layers) else _pasted(part.view(next(draw)), part.box, self.box)
+                for part in self.parts
+            ),
+        )
+        pair = inside.transmittance, inside.addition
+        return Layers(*(values.astype(np.float16).astype(np.float32) for values in pair))
+
+    def apply(self, image: np.ndarray, inside: Layers | None) -> np.ndarray:
+        """The image with the artifact in front of it.
+
+        Args:
+            image: clean photo, uint8 [H, W, 3].
+            inside: what `view` gave, where effects vary; else None.
+
+        Returns:
+            uint8 [H, W, 3].
+        """
+        formed = image.copy() if self.static is None else self.static.apply(image)
+        if inside is not None and self.box is not None:
+            formed[self.box] = inside.apply(np.ascontiguousarray(image[self.box]))
+        return formed
+
+    def whole(self, inside: Layers | None, height: int, width: int) -> Layers:
+        """The layers of the whole frame: `static` with `inside` in its place."""
+        base = self.static
+        if base is None:
+            base = Layers(np.ones((height, width, 3), np.float32), np.zeros((height, width, 3), np.float32))
+        if inside is None or self.box is None:
+            return base
+        transmittance, addition = base.transmittance.copy(), base.addition.copy()
+        transmittance[self.box], addition[self.box] = inside.transmittance, inside.addition
+        return Layers(transmittance, addition)
+
+
+def _bounding_box(boxes: list[Box]) -> Box:
+    rows, columns = (
+        slice(min(box[axis].start for box in boxes), max(box[axis].stop for box in boxes)) for axis in (0, 1)
+    )
+    return rows, columns
+
+
+def _pasted(layers: Layers, box: Box, frame: Box) -> Layers:
+    """Layers of `box` on clear ground of a rectangle `frame` around it."""
+    if box == frame:
+        return layers
+    shape = (frame[0].stop - frame[0].start, frame[1].stop - frame[1].start, 3)
+    transmittance, addition = np.ones(shape, np.float32), np.zeros(shape, np.float32)
+    rows, columns = (slice(b.start - f.start, b.stop - f.start) for b, f in zip(box, frame, strict=True))
+    transmittance[rows, columns], addition[rows, columns] = layers.transmittance, layers.addition
+    return Layers(transmittance, addition)

@@ -1,0 +1,76 @@
+"""A semi-transparent watermark: a camera logo at the frame's centre and a line of text beneath it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from ssa_nerfstudio.experiments.effects.layers import Layers
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+
+_OVERSAMPLING = 4
+
+
+@dataclass(frozen=True)
+class Watermark:
+    """Stock footage's watermark, composited at one opacity over every frame (paper, synthetic artifacts).
+
+    Raises:
+        ValueError: a field is out of its range.
+    """
+
+    alpha: float = 0.4
+    """Opacity of the mark, in (0, 1]; the paper uses 0.4."""
+    size: float = 0.62
+    """Width of the text line as a fraction of the frame's width, in (0, 1]; smaller where a flat frame needs it."""
+    colour: tuple[int, int, int] = (255, 255, 255)
+    """Colour of the mark, sRGB, 0..255."""
+    text: str = "SAMPLE STOCK"
+    """The line beneath the logo; not empty."""
+
+    def __post_init__(self) -> None:
+        require(self, alpha="(0, 1]", size="(0, 1]")
+        require_colours(self, "colour")
+        if not self.text.strip():
+            raise ValueError(f"Watermark.text must not be empty, got {self.text!r}")
+
+    def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
+        """The watermark at one frame size.
+
+        Args:
+            height: frame height, pixels, at least 1.
+            width: frame width, pixels, at least 1.
+            rng: not drawn from; a watermark has no chance in it.
+
+        Returns:
+            T = 1 - A and B = A colour, with A = alpha times the mark's coverage of the pixel.
+        """
+        return Layers.composited(self.alpha * self._coverage(height, width), np.array(self.colour) / 255)
+
+    def _coverage(self, height: int, width: int) -> np.ndarray:
+        """Share of each pixel under the mark, [height, width] in [0, 1]."""
+        canvas = Image.new("L", (width * _OVERSAMPLING, height * _OVERSAMPLING))
+        draw = ImageDraw.Draw(canvas)
+        centre_x, centre_y = canvas.width / 2, canvas.height / 2
+        # Logo and text together are 0.8 of the text's width high, measured about the centre.
+        extent = min(self.size * canvas.width, 1.2 * canvas.height)
+
+        def box(half_width: float, top: float, bottom: float) -> tuple[float, float, float, float]:
+            return (
+                centre_x - half_width * extent,
+                centre_y + top * extent,
+                centre_x + half_width * extent,
+                centre_y + bottom * extent,
+            )
+
+        draw.rounded_rectangle(box(0.1, -0.215, -0.1), radius=0.03 * extent, fill=255)
+        draw.rounded_rectangle(box(0.235, -0.165, 0.165), radius=0.05 * extent, fill=255)
+        draw.ellipse(box(0.125, -0.125, 0.125), fill=0)
+        draw.ellipse(box(0.085, -0.085, 0.085), fill=255)
+
+        reference = ImageFont.load_default(100).getlength(self.text)
+        font = ImageFont.load_default(max(1.0, 100 * extent / reference))
+        draw.text((centre_x, centre_y + 0.28 * extent), self.text, fill=255, font=font, anchor="mm")
+        return np.asarray(canvas.reduce(_OVERSAMPLING), dtype=np.float64) / 255

@@ -1,0 +1,1 @@
+"""Simulated artifacts in front of a dataset's training photos, and the built-in scene."""

@@ -1,0 +1,316 @@
+"""A synthetic capture whose every pixel is known: a textured room with boxes, ray-cast from an arc of cameras."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from PIL import Image
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.experiments.effects.layers import Layers
+
+_CUBOIDS = (
+    ((0.00, 0.00, 1.80), (4.40, 4.40, 1.80), 0, 0, (70, 62, 58), (212, 188, 154)),
+    ((0.00, 0.10, 0.55), (0.45, 0.45, 0.55), 0, 0, (38, 52, 84), (226, 196, 120)),
+    ((0.05, 0.10, 1.49), (0.28, 0.28, 0.28), 30, 35, (122, 34, 30), (240, 214, 190)),
+    ((-1.15, -0.45, 0.35), (0.35, 0.50, 0.35), 25, 0, (24, 82, 70), (206, 226, 150)),
+    ((1.15, -0.55, 0.45), (0.40, 0.30, 0.45), -35, 0, (70, 34, 96), (246, 170, 92)),
+    ((0.95, 0.95, 0.90), (0.30, 0.30, 0.90), 15, 0, (28, 28, 36), (232, 232, 224)),
+    ((-0.95, 1.00, 0.25), (0.50, 0.35, 0.25), 0, 0, (20, 88, 140), (250, 226, 96)),
+    ((0.05, -1.20, 0.20), (0.30, 0.22, 0.20), 60, 0, (126, 70, 28), (160, 214, 226)),
+)
+"""Centre and half sizes (scene units, z up, floor at 0), yaw and roll (degrees), dark and light texture colour (sRGB).
+
+The first is the room, seen from inside; the others are the boxes in it.
+"""
+_LIGHT = np.array([0.36, -0.48, 0.80])
+_TEXELS = 96
+"""Texture resolution, texels per scene unit."""
+_SUPERSAMPLING = 3
+_SPARSE_POINTS = 4000
+_SPARSE_NOISE = 0.005
+
+
+class _Face(NamedTuple):
+    """A textured rectangle, seen from the side its normal points to."""
+
+    centre: np.ndarray
+    axes: np.ndarray
+    """u, v and the normal as rows, [3, 3]."""
+    half: tuple[float, float]
+    texture: np.ndarray
+    """Display colours, float32 [rows along v, columns along u, 3]."""
+
+
+class _Cuboid(NamedTuple):
+    """The room or a box, with the radius of the sphere around it."""
+
+    centre: np.ndarray
+    radius: float
+    faces: list[_Face]
+
+
+@dataclass(frozen=True)
+class DemoScene:
+    """The demo's scene and cameras; everything in it follows from the fields.
+
+    Raises:
+        ValueError: a field is out of its range.
+    """
+
+    views: int = 48
+    """Training views, at least 2."""
+    test_views: int = 8
+    """Held-out views, spread evenly between the training views; from 1 to `views`."""
+    width: int = 160
+    """Image width, pixels, at least 1."""
+    height: int = 112
+    """Image height, pixels, at least 1."""
+    fov_x: float = 65.0
+    """Horizontal field of view, degrees, in (0, 180)."""
+    seed: int = 0
+    """Seed of textures, camera path and sparse points; not negative."""
+
+    def __post_init__(self) -> None:
+        for name, lowest in (("views", 2), ("test_views", 1), ("width", 1), ("height", 1), ("seed", 0)):
+            if getattr(self, name) < lowest:
+                raise ValueError(f"DemoScene.{name} must be at least {lowest}, got {getattr(self, name)}")
+        if self.test_views > self.views:
+            raise ValueError(f"DemoScene.test_views must be in [1, views = {self.views}], got {self.test_views}")
+        if not 0 < self.fov_x < 180:
+            raise ValueError(f"DemoScene.fov_x must be in (0, 180) degrees, got {self.fov_x}")
+
+    @property
+    def focal_length(self) -> float:
+        """Focal length in pixels along both axes; the principal point is the image's centre."""
+        return float(self.width / 2 / np.tan(np.radians(self.fov_x) / 2))
+
+    @cached_property
+    def cameras(self) -> tuple[np.ndarray, np.ndarray]:
+        """Camera-to-world matrices of training [views, 4, 4] and test cameras [test_views, 4, 4].
+
+        OpenGL axes (x right, y up, z backwards). Height and pitch jump from view to view, so that what the lower
+        part of one frame shows is higher up in others.
+        """
+        count = self.views + self.test_views
+        index = np.arange(count)
+        # Irrational steps spread every quantity evenly over its range in any run of neighbouring views.
+        start = np.random.default_rng([self.seed, 1]).uniform(size=5)
+        spread = (start + index[:, None] * (np.sqrt([2, 3, 5, 7, 11]) % 1)) % 1
+        lowest, highest = np.array([3.1, 0.6, -0.8, -0.8, -1.4]), np.array([3.9, 3.0, 0.8, 0.8, 1.5])
+        radius, elevation, *target = (lowest + (highest - lowest) * spread).T
+        azimuth = -np.pi * (index + 0.5) / count
+        position = np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth), elevation], axis=1)
+
+        back = position - np.stack(target, axis=1)
+        right = np.cross([0.0, 0.0, 1.0], back)
+        axes = np.stack([right, np.cross(back, right), back], axis=2)
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        poses[:, :3, 3] = position
+        held_out = ((np.arange(self.test_views) + 0.5) * count / self.test_views).astype(int)
+        return np.delete(poses, held_out, axis=0), poses[held_out]
+
+    def rays(self, camera_to_world: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """World directions [N, 3], of depth 1, through pixel positions [N, 2] (x right, y down, (0, 0) a corner)."""
+        x = (pixels[:, 0] - self.width / 2) / self.focal_length
+        y = (self.height / 2 - pixels[:, 1]) / self.focal_length
+        return np.stack([x, y, -np.ones_like(x)], axis=1) @ camera_to_world[:3, :3].T
+
+    def trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Follows rays to the first surface they meet.
+
+        Args:
+            origin: where all rays start, [3], inside the room and outside the boxes.
+            directions: [N, 3], of any length.
+
+        Returns:
+            Distance in multiples of `directions` [N] and display colour [N, 3] in [0, 1], both float32.
+        """
+        rays = np.ascontiguousarray(directions.T, dtype=np.float32)
+        depth = np.full(rays.shape[1], np.inf, dtype=np.float32)
+        colour = np.zeros((rays.shape[1], 3), dtype=np.float32)
+        lengths = np.square(rays).sum(axis=0)
+        for cuboid in self._cuboids:
+            offset = (cuboid.centre - origin).astype(np.float32)
+            # The square of a ray's way past the bounding sphere's centre tells whether it meets the sphere.
+            near = np.flatnonzero(np.square(offset @ rays) >= (offset @ offset - cuboid.radius**2) * lengths)
+            bundle = rays.take(near, axis=1)
+            for face in cuboid.faces:
+                u0, v0, n0 = (face.axes @ (origin - face.centre)).astype(np.float32)
+                if n0 <= 0:
+                    continue
+                du, dv, dn = face.axes.astype(np.float32) @ bundle
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    t = -n0 / dn
+                    u, v = u0 + t * du, v0 + t * dv
+                # The margin closes the hairline between faces that share an edge.
+                inside = (np.abs(u) <= face.half[0] + 1e-4) & (np.abs(v) <= face.half[1] + 1e-4)
+                hits = np.flatnonzero(inside & (t > 0) & (t < depth[near]))
+                depth[near[hits]] = t[hits]
+                rows, columns, _ = face.texture.shape
+                row = ((v[hits] + face.half[1]) * _TEXELS).astype(int).clip(0, rows - 1)
+                column = ((u[hits] + face.half[0]) * _TEXELS).astype(int).clip(0, columns - 1)
+                colour[near[hits]] = face.texture[row, column]
+        return depth, colour
+
+    def render(self, camera_to_world: np.ndarray) -> np.ndarray:
+        """One camera's clean photo, uint8 [height, width, 3]: 3 x 3 rays a pixel, box-filtered.
+
+        Args:
+            camera_to_world: [4, 4], OpenGL axes.
+        """
+        steps = _SUPERSAMPLING
+        x, y = ((np.arange(side * steps) + 0.5) / steps for side in (self.width, self.height))
+        pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+        _, colour = self.trace(camera_to_world[:3, 3], self.rays(camera_to_world, pixels))
+        colour = colour.reshape(self.height, steps, self.width, steps, 3).mean(axis=1).mean(axis=2)
+        return np.rint(colour * 255).astype(np.uint8)
+
+    def sparse_points(self) -> tuple[np.ndarray, np.ndarray]:
+        """What structure from motion would find: noisy points on surfaces that training cameras see.
+
+        Returns:
+            Positions [4000, 3] (standard deviation 0.005 scene units) and display colours uint8 [4000, 3].
+        """
+        rng = np.random.default_rng([self.seed, 2])
+        train, _ = self.cameras
+        points, colours = [], []
+        for pose, share in zip(train, np.array_split(np.arange(_SPARSE_POINTS), len(train)), strict=True):
+            directions = self.rays(pose, rng.uniform(size=(len(share), 2)) * [self.width, self.height])
+            depth, colour = self.trace(pose[:3, 3], directions)
+            points.append(pose[:3, 3] + depth[:, None] * directions)
+            colours.append(np.rint(colour * 255).astype(np.uint8))
+        noise = rng.normal(scale=_SPARSE_NOISE, size=(_SPARSE_POINTS, 3))
+        return np.concatenate(points) + noise, np.concatenate(colours)
+
+    def write(self, output: Path, artifact: Layers | None) -> None:
+        """Writes the capture as a nerfstudio dataset: images/, transforms.json and sparse_pc.ply.
+
+        Args:
+            output: folder to make; it appears only when complete, its parent is made where missing.
+            artifact: laid over the training images, or None; test images stay clean.
+
+        Raises:
+            FileExistsError: `output` exists already.
+            ValueError: the artifact is not of the images' size.
+        """
+        if output.exists():
+            raise FileExistsError(f"{output} exists already: remove it or name another folder")
+        if artifact is not None and artifact.transmittance.shape != (self.height, self.width, 3):
+            height, width, _ = artifact.transmittance.shape
+            raise ValueError(f"artifact is {width} x {height}, the scene's images are {self.width} x {self.height}")
+        output.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as scratch:
+            dataset = Path(scratch) / output.name
+            (dataset / "images").mkdir(parents=True)
+            names: dict[str, list[str]] = {}
+            for split, poses in zip(("train", "test"), self.cameras, strict=True):
+                names[split] = [f"images/{split}_{number:04d}.png" for number in range(len(poses))]
+                for name, pose in zip(names[split], poses, strict=True):
+                    photo = self.render(pose)
+                    if artifact is not None and split == "train":
+                        photo = artifact.apply(photo)
+                    Image.fromarray(photo).save(dataset / name)
+            _write_ply(dataset / "sparse_pc.ply", *self.sparse_points())
+            (dataset / "transforms.json").write_text(json.dumps(self._transforms(names["train"], names["test"])))
+            dataset.rename(output)
+
+    def _transforms(self, train: list[str], test: list[str]) -> dict[str, object]:
+        poses = np.concatenate(self.cameras).tolist()
+        return {
+            "camera_model": "OPENCV",
+            "fl_x": self.focal_length,
+            "fl_y": self.focal_length,
+            "cx": self.width / 2,
+            "cy": self.height / 2,
+            "w": self.width,
+            "h": self.height,
+            "ply_file_path": "sparse_pc.ply",
+            "train_filenames": train,
+            "val_filenames": test,
+            "test_filenames": test,
+            "frames": [
+                {"file_path": name, "transform_matrix": pose} for name, pose in zip(train + test, poses, strict=True)
+            ],
+        }
+
+    @cached_property
+    def _cuboids(self) -> list[_Cuboid]:
+        rng = np.random.default_rng([self.seed, 0])
+        return [_cuboid(number, *geometry, rng=rng) for number, geometry in enumerate(_CUBOIDS)]
+
+
+def _cuboid(
+    number: int,
+    centre: tuple[float, ...],
+    halves: tuple[float, ...],
+    yaw: float,
+    roll: float,
+    *colours: tuple[int, ...],
+    rng: np.random.Generator,
+) -> _Cuboid:
+    """One row of the table, each face with its own texture and baked light."""
+    (cy, cr), (sy, sr) = np.cos(np.radians([yaw, roll])), np.sin(np.radians([yaw, roll]))
+    rotation = np.array([[cy, -sy * cr, sy * sr], [sy, cy * cr, -cy * sr], [0, sr, cr]])
+    faces = []
+    for side in range(6):
+        axis, sign = side // 2, 2 * (side % 2) - 1
+        u, v = (other for other in range(3) if other != axis)
+        normal = rotation[:, axis] * (-sign if number == 0 else sign)
+        half = (halves[u], halves[v])
+        texture = _texture((number + side) % 6, half, np.array(colours) / 255, rng) * (0.7 + 0.4 * normal @ _LIGHT)
+        middle = np.array(centre) + sign * halves[axis] * rotation[:, axis]
+        axes = np.stack([rotation[:, u], rotation[:, v], normal])
+        faces.append(_Face(middle, axes, half, texture.clip(0, 1).astype(np.float32)))
+    return _Cuboid(np.array(centre), float(np.linalg.norm(halves)), faces)
+
+
+def _texture(kind: int, half: tuple[float, float], colours: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One of six patterns between a dark and a light colour, under several octaves of value noise.
+
+    Returns:
+        Colours [rows along v, columns along u, 3], about [0, 1].
+    """
+    width, height = (round(2 * side * _TEXELS) for side in half)
+    period = 0.3 * np.sqrt(max(half)) * rng.uniform(0.8, 1.2)
+    y, x = np.mgrid[:height, :width].astype(np.float32) / np.float32(_TEXELS * period)
+    noise = np.zeros((height, width), dtype=np.float32)
+    for octave in range(5):
+        cell = 64 >> octave
+        lattice = Image.fromarray(rng.uniform(-1, 1, (height // cell + 2, width // cell + 2)).astype(np.float32))
+        smooth = lattice.resize((lattice.width * cell, lattice.height * cell), Image.Resampling.BICUBIC)
+        noise += 0.75**octave * np.asarray(smooth)[:height, :width]
+    row = np.floor(y)
+    if kind == 0:  # bricks
+        x = x / 2 + row / 2
+        mask = (x % 1 > 0.06) & (y % 1 > 0.12)
+    elif kind == 1:  # diagonal stripes
+        x = x + 0.5 * y
+        mask = x % 1 > 0.5
+    elif kind == 2:  # dots
+        mask = np.hypot(x % 1 - 0.5, y % 1 - 0.5) < 0.34
+    elif kind == 3:  # planks
+        mask = x % 1 > 0.08
+    elif kind == 4:  # checkers
+        mask = (np.floor(x) + row) % 2 > 0
+    else:  # contours
+        mask = np.sin(9 * noise) > 0
+    tone = rng.uniform(-0.25, 0.25, (64, 64)).astype(np.float32)[row.astype(int) % 64, np.floor(x).astype(int) % 64]
+    blend = np.clip(np.where(mask, 0.8, 0.1) + tone + 0.24 * noise, 0, 1)[..., None]
+    return ((1 - blend) * colours[0] + blend * colours[1]) * rng.uniform(0.94, 1.06, 3)
+
+
+def _write_ply(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
+    """An ASCII point cloud from positions [N, 3] and colours uint8 [N, 3]."""
+    properties = [f"property float {axis}" for axis in "xyz"]
+    properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]
+    rows = np.hstack([points, colours])
+    np.savetxt(path, rows, fmt="%.5f %.5f %.5f %d %d %d", header="\n".join(header), comments="")

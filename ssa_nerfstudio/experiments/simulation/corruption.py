@@ -1,0 +1,100 @@
+"""Training photos with the artifact in front of them, and the true layers beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from ssa_nerfstudio._system.ordered_map import in_order
+from ssa_nerfstudio.cameras.groups import group_frames
+from ssa_nerfstudio.cameras.lens import Lens, undistort, undistorted
+from ssa_nerfstudio.data.photos import read_photo, write_photo
+from ssa_nerfstudio.data.transforms import Dataset, View
+from ssa_nerfstudio.experiments.effects.composition import Composition
+from ssa_nerfstudio.experiments.effects.layers import Layers
+from ssa_nerfstudio.experiments.simulation.layer_files import LayerFile, write_view
+from ssa_nerfstudio.experiments.simulation.scene import Scene
+
+
+def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path, threads: int) -> Iterator[None]:
+    """Writes the training photos and the layers, one raw frame size after the other; yields after every photo.
+
+    Args:
+        dataset: what to read.
+        scene: what to put in front; not empty.
+        names: each photo's path in the output.
+        folder: the output.
+        threads: photos worked on at once.
+
+    Raises:
+        InputError: a photo cannot be read or is not as transforms.json says.
+    """
+    numbered = [(number, view) for number, view in enumerate(dataset.views) if view.role == "train"]
+    # In the output's order, which is the one that nerfstudio numbers cameras in.
+    cameras = _first_views(sorted((view for _, view in numbered), key=lambda view: Path(names[view.path])))
+    (folder / "layers").mkdir()
+    raw, straight = (LayerFile(folder / "layers", frame, len(cameras)) for frame in ("raw", "undistorted"))
+
+    for size in dict.fromkeys(view.size for _, view in numbered):
+        artifact = scene.draw(*size)
+
+        def work(item: tuple[int, View], artifact: Composition = artifact) -> Layers | None:
+            number, view = item
+            photo = read_photo(dataset.source(view.path), view.lens.width, view.lens.height)
+            inside = None
+            if artifact.box is not None:
+                inside = artifact.view(scene.view_generators(artifact, number))
+                path = folder / "layers" / "views" / PurePosixPath(view.path).with_suffix(".npz")
+                write_view(path, inside, artifact.box, view.size)
+            write_photo(folder / names[view.path], artifact.apply(photo, inside))
+            return inside
+
+        mean = _Mean()
+        for inside in in_order(work, [item for item in numbered if item[1].size == size], threads):
+            mean.add(inside)
+            yield
+        layers = artifact.whole(mean.value(), *size)
+        for camera, view in enumerate(cameras):
+            if view.size == size:
+                both = ((raw, layers), (straight, undistorted_layers(layers, view.lens)))
+                # Compressing them takes as long as dozens of photos.
+                list(in_order(lambda pair, camera=camera: pair[0].add(camera, pair[1]), both, threads))
+
+
+def undistorted_layers(layers: Layers, lens: Lens) -> Layers:
+    """An artifact of the raw frame in the undistorted, cropped frame: T and B warped like photos, premultiplied."""
+    # Bilinear weights add up to 1 only within rounding.
+    return Layers(undistort(layers.transmittance, lens).clip(0, 1), undistort(layers.addition, lens))
+
+
+def _first_views(views: list[View]) -> list[View]:
+    """The first view of each camera, in order of appearance."""
+    lenses = [undistorted(view.lens) for view in views]
+    described = np.array([(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses])
+    groups = group_frames(described)
+    return [views[groups.index(group)] for group in range(max(groups) + 1)]
+
+
+class _Mean:
+    """Mean of the layers of many views, which are added in a fixed order so that it always comes out the same."""
+
+    def __init__(self) -> None:
+        self._sums: tuple[np.ndarray, np.ndarray] | None = None
+        self._count = 0
+
+    def add(self, layers: Layers | None) -> None:
+        if layers is None:
+            return
+        pair = layers.transmittance, layers.addition
+        if self._sums is None:
+            self._sums = np.zeros(pair[0].shape), np.zeros(pair[1].shape)
+        for total, values in zip(self._sums, pair, strict=True):
+            total += values
+        self._count += 1
+
+    def value(self) -> Layers | None:
+        if self._sums is None:
+            return None
+        return Layers(*((total / self._count).astype(np.float32) for total in self._sums))

@@ -1,0 +1,128 @@
+"""A scene names effects, their parameters and a seed; drawn for a frame size it becomes the artifact."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.configuration import build, locate, read
+from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS, Effect, effect_class
+from ssa_nerfstudio.experiments.effects.composition import Composition
+from ssa_nerfstudio.experiments.effects.layers import VaryingLayers
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A scene as its YAML file states it.
+
+    Raises:
+        ValueError: the seed is negative.
+    """
+
+    effects: list[Any]
+    """From the scene outwards; each a name, a .yaml file, or keys and values: `effect` and that effect's parameters."""
+    seed: int = 0
+    """Decides all that chance decides; not negative."""
+    provenance: dict = field(default_factory=dict)
+    """What wrote the file, where `ssa simulate` did; not read."""
+
+    def __post_init__(self) -> None:
+        if self.seed < 0:
+            raise ValueError(f"SceneFile.seed must not be negative, got {self.seed}")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Effects in front of one another, the last nearest to the eye, and the seed that they are drawn with."""
+
+    effects: tuple[tuple[str, Effect], ...]
+    """Name and parameters of each effect."""
+    seed: int = 0
+    """Not negative."""
+
+    def draw(self, height: int, width: int) -> Composition:
+        """The artifact at one frame size, pixels; there must be effects."""
+        return Composition(
+            [
+                effect.layers(height, width, np.random.default_rng([self.seed, *stream]))
+                for stream, (_, effect) in zip(self._streams(), self.effects, strict=True)
+            ]
+        )
+
+    def view_generators(self, artifact: Composition, view: int) -> list[np.random.Generator]:
+        """What decides the one view's own part of every effect that varies.
+
+        Args:
+            artifact: what `draw` gave.
+            view: number of the view in the dataset's sorted order.
+        """
+        return [
+            np.random.default_rng([self.seed, *stream, 1 + view])
+            for stream, part in zip(self._streams(), artifact.parts, strict=True)
+            if isinstance(part, VaryingLayers)
+        ]
+
+    def describe(self) -> list[dict[str, Any]]:
+        """Each effect with all its parameters, as a scene file states them."""
+        return [
+            {"effect": name} | {key: _plain(value) for key, value in dataclasses.asdict(effect).items()}  # type: ignore[call-overload]
+            for name, effect in self.effects
+        ]
+
+    def _streams(self) -> list[tuple[int, int]]:
+        # An effect comes out the same whatever stands beside it; one named twice comes out differently.
+        names = [name for name, _ in self.effects]
+        return [(zlib.crc32(name.encode()), names[:number].count(name)) for number, name in enumerate(names)]
+
+
+def read_effects(names: tuple[str, ...], stated_in: str = "") -> tuple[tuple[str, Effect], ...]:
+    """Effects from shipped names or .yaml files.
+
+    Args:
+        names: names, or paths of .yaml files.
+        stated_in: file and key that name them, for messages.
+
+    Raises:
+        InputError: one cannot be found or is faulty.
+    """
+    effects = []
+    for name in names:
+        path = locate("effects", name, stated_in)
+        effects.append(_effect(read(path), str(path)))
+    return tuple(effects)
+
+
+def read_scene(name: str) -> Scene:
+    """A scene from a shipped name or a .yaml file.
+
+    Raises:
+        InputError: it cannot be found, or it or an effect that it names is faulty.
+    """
+    path = locate("scenes", name)
+    stated = build(SceneFile, read(path), str(path))
+    effects: list[tuple[str, Effect]] = []
+    for number, item in enumerate(stated.effects):
+        if isinstance(item, str):
+            effects += read_effects((item,), f"{path}: effects[{number}]")
+        else:
+            effects.append(_effect(item, f"{path}: effects[{number}]"))
+    return Scene(tuple(effects), stated.seed)
+
+
+def _effect(values: Any, where: str) -> tuple[str, Effect]:
+    if not isinstance(values, dict) or "effect" not in values:
+        raise InputError(f"{where}: key 'effect' is missing", f"it names one of {', '.join(EFFECTS)}")
+    name = values["effect"]
+    if not isinstance(name, str) or name not in EFFECTS:
+        raise InputError(f"{where}: effect {name!r} is unknown", f"choose one of {', '.join(EFFECTS)}")
+    parameters = {key: value for key, value in values.items() if key != "effect"}
+    return name, build(effect_class(name), parameters, where)
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,76 @@
+"""The simulator: a nerfstudio dataset in, the same with an artifact in front of its training photos out."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path, PurePosixPath
+
+from rich.console import Console
+from rich.progress import Progress
+
+from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.writing import staged_folder
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.simulation.corruption import corrupt
+from ssa_nerfstudio.experiments.simulation.provenance import scene_record, transforms
+from ssa_nerfstudio.experiments.simulation.scene import Scene
+
+
+def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None:
+    """Writes the dataset with the scene's artifact in front of every training photo.
+
+    Training photos become PNG: I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits. Everything else is copied
+    byte for byte; without effects that is every file but transforms.json, which only gains the split.
+
+    Args:
+        dataset: what to read.
+        scene: what to put in front.
+        output: folder to make; it appears only when complete.
+        threads: photos worked on at once, at least 1; memory is proportional to it and to the photos' size, not to
+            their number.
+
+    Raises:
+        InputError: the folder exists or cannot be written, or a file of the dataset is missing or cannot be used.
+    """
+    corrupted = [view.path for view in dataset.views if view.role == "train"] if scene.effects else []
+    renamed = {path: str(PurePosixPath(path).with_suffix(".png")) for path in corrupted}
+    names = {view.path: view.path for view in dataset.views} | renamed
+    _check_names(names)
+    console = Console()
+    # Where there is no terminal, an ended bar leaves an empty line.
+    progress = Progress(console=console, transient=True, disable=not console.is_terminal)
+    with staged_folder(output) as folder, progress:
+        task = progress.add_task("Simulating", total=len(dataset.views))
+        for view in dataset.views:
+            if view.path not in renamed:
+                _copy(dataset.source(view.path), folder / view.path)
+                progress.advance(task)
+            for kind, path in view.companions:
+                _copy(dataset.source(path, kind), folder / path)
+        for path in dataset.points:
+            _copy(dataset.root / path, folder / path)
+        if scene.effects:
+            for _ in corrupt(dataset, scene, names, folder, threads):
+                progress.advance(task)
+        (folder / "scene.yaml").write_text(scene_record(dataset, scene), encoding="utf-8")
+        # Last, because it is what makes the folder a dataset.
+        (folder / "transforms.json").write_text(json.dumps(transforms(dataset, names), indent=4), encoding="utf-8")
+
+
+def _check_names(names: dict[str, str]) -> None:
+    owners: dict[PurePosixPath, str] = {}
+    for path, name in names.items():
+        if (other := owners.setdefault(PurePosixPath(name), path)) != path:
+            raise InputError(f"{other} and {path} would both be written to {name}", "rename one of them and its frame")
+
+
+def _copy(source: Path, target: Path) -> None:
+    try:
+        content = source.open("rb")
+    except OSError as error:
+        what = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error.strerror})"
+        raise InputError(f"{source} {what}; put it there or remove it from transforms.json") from error
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with content, target.open("wb") as file:
+        shutil.copyfileobj(content, file)

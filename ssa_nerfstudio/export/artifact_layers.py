@@ -1,0 +1,125 @@
+"""A trained artifact as layers T and B (I = T C + B) in the frame that is asked for: undistorted, raw, or enlarged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import scipy.ndimage
+import torch
+
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.export.checkpoint import Checkpoint
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.resampling import straight_color
+from ssa_nerfstudio.plugin.camera_matching import lens as lens_of
+
+_KNOWN = 0.999
+"""Weight of pixels of the undistorted frame in one of the raw frame: less is blended with what is not known."""
+
+
+@dataclass(frozen=True)
+class ArtifactLayers:
+    """What one camera's artifact does to a photo."""
+
+    transmittance: np.ndarray
+    """T: float32 [H, W, 3] in [0, 1]."""
+    addition: np.ndarray
+    """B: float32 [H, W, 3], not negative."""
+    camera: Lens
+    """Intrinsics of the frame that the layers are in."""
+    frame: Literal["undistorted", "raw"]
+    """undistorted: the pixels that nerfstudio trains on; raw: those of the photos as they were taken."""
+    kind: Literal["learned", "given"]
+    known: np.ndarray | None = None
+    """bool [H, W]: False where the crop of the undistorted frame left nothing of the raw one; None: all is known."""
+
+    def straight(self) -> tuple[np.ndarray, np.ndarray]:
+        """Straight colour W [H, W, 3] and matte A [H, W, 1], both in [0, 1]."""
+        color, alpha = straight_color(torch.from_numpy(self.transmittance), torch.from_numpy(self.addition))
+        return color.numpy(), alpha.numpy()
+
+    def covered(self, threshold: float) -> np.ndarray:
+        """Where the matte exceeds the threshold, bool [H, W]; what is not known is as the nearest pixel that is.
+
+        A dashboard does not end where the undistorted frame does: structure from motion must not look there.
+        """
+        covered = self.straight()[1][..., 0] > threshold
+        if self.known is None or self.known.all():
+            return covered
+        y, x = np.asarray(
+            scipy.ndimage.distance_transform_edt(~self.known, return_distances=False, return_indices=True)
+        )
+        return covered[y, x]
+
+    def sized(self, width: int, height: int) -> ArtifactLayers:
+        """The same frame at another resolution, resampled bilinearly (reduced: by areas)."""
+        if (width, height) == (self.camera.width, self.camera.height):
+            return self
+        across, down = width / self.camera.width, height / self.camera.height
+        method = cv2.INTER_AREA if across < 1 else cv2.INTER_LINEAR
+        transmittance, addition = (
+            cv2.resize(plane, (width, height), interpolation=method) for plane in (self.transmittance, self.addition)
+        )
+        c = self.camera
+        camera = Lens(width, height, c.fx * across, c.fy * down, c.cx * across, c.cy * down, c.distortion, c.model)
+        known = self.known
+        if known is not None:
+            known = cv2.resize(known.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+        return ArtifactLayers(transmittance, addition, camera, self.frame, self.kind, known)
+
+
+def undistorted_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
+    """Every camera group's artifact in the frame it was trained in.
+
+    Raises:
+        InputError: the checkpoint has no overlay.
+    """
+    artifacts = checkpoint.artifacts()
+    result = []
+    for group, key in enumerate(artifacts.camera_keys.tolist()):
+        overlay = artifacts[group]
+        with torch.no_grad():
+            transmittance, addition = (layer.expand(-1, -1, 3).numpy().copy() for layer in overlay.layers())
+        kind = "learned" if isinstance(overlay, ScreenSpaceOverlay) else "given"
+        width, height, *intrinsics = key
+        camera = Lens(int(width), int(height), *intrinsics)
+        result.append(ArtifactLayers(transmittance, addition, camera, "undistorted", kind))
+    return result
+
+
+def raw_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
+    """Every camera group's artifact in the frame of its original photos, through the lens distortion.
+
+    What the crop of the undistorted frame left out of the raw one is clear: nothing is known of it.
+
+    Raises:
+        InputError: the checkpoint does not know its lenses, or nerfstudio cannot undistort them.
+    """
+    described = checkpoint.artifacts().lenses.tolist()
+    if not described:
+        raise InputError(
+            f"{checkpoint.path} was written before checkpoints kept their lenses: nothing leads to the raw frame",
+            "resume the run for one more step, or leave out --raw-frame",
+        )
+    result = []
+    for layers, row in zip(undistorted_layers(checkpoint), described, strict=True):
+        try:
+            lens = lens_of(row)
+            target = undistorted(lens)
+        except ValueError as error:
+            raise InputError(f"{checkpoint.path}: {error}", "leave out --raw-frame") from error
+        if (target.width, target.height) != (layers.camera.width, layers.camera.height):
+            raise InputError(
+                f"{checkpoint.path}: the overlay is {layers.camera.width} x {layers.camera.height}, its lens gives "
+                f"{target.width} x {target.height}",
+                "leave out --raw-frame",
+            )
+        transmittance = distort(layers.transmittance, lens, 1.0)
+        addition = distort(layers.addition, lens, 0.0)
+        known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > _KNOWN
+        result.append(ArtifactLayers(transmittance, addition, lens, "raw", layers.kind, known))
+    return result

@@ -1,0 +1,1 @@
+"""The photometric loss with its gradient, for numba (CPU) and Triton (CUDA)."""

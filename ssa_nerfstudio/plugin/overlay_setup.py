@@ -1,0 +1,98 @@
+"""A first look at the photos, before anything is trained: what is in front of each camera, and how it starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.utils.rich_utils import CONSOLE
+from rich.progress import track
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence.detection import LEAST_VIEWS, Detection, detect, static_area
+from ssa_nerfstudio.evidence.initialization import initialize
+from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
+from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
+from ssa_nerfstudio.plugin.settings import ModelSettings
+
+
+def learned_overlays(
+    config: ModelSettings, photos: list[dict[str, Any]], groups: list[int], sizes: list[tuple[int, int]]
+) -> list[ScreenSpaceOverlay | None]:
+    """An overlay for each camera group; under overlay "auto" None where detection finds nothing.
+
+    Args:
+        config: the model's; overlay "auto" or "on".
+        photos: the datamanager's undistorted cache, in the order of the capture.
+        groups: each photo's group.
+        sizes: height and width of each group's frame.
+    """
+    overlays: list[ScreenSpaceOverlay | None] = []
+    for group, size in enumerate(sizes):
+        overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, config.overlay_light == "on")
+        if config.overlay == "auto" or config.overlay_start != "constant":
+            name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
+            statistics = _look_at([photo for photo, at in zip(photos, groups, strict=True) if at == group], name)
+            detection = detect(statistics) if config.overlay == "auto" else None
+            if detection is not None and not _found(detection, name):
+                overlays.append(None)
+                continue
+            if config.overlay_start == "detected":
+                area = static_area(statistics) if detection is None else detection.area
+                light = area.adds_light if config.overlay_light == "auto" else config.overlay_light == "on"
+                overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, light)
+                initialize(overlay, statistics, area)
+            elif config.overlay_start == "statistics":
+                initialize(overlay, statistics)
+        overlays.append(overlay)
+    return overlays
+
+
+def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[GivenOverlay]:
+    """The true layers of every camera group from an .npz file.
+
+    Raises:
+        InputError: it holds none, or layers of other sizes.
+    """
+    if path is None:
+        raise InputError(
+            "overlay 'given' needs the layers", "add --pipeline.model.overlay-given FILE.npz with arrays T and B"
+        )
+    try:
+        arrays = np.load(path)
+        names = [("T", "B")] if len(sizes) == 1 and "T" in arrays else [(f"T{g}", f"B{g}") for g in range(len(sizes))]
+        overlays = [GivenOverlay(torch.from_numpy(arrays[t]), torch.from_numpy(arrays[b])) for t, b in names]
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"{path} holds no usable layers ({error})", "give an .npz with T and B [H, W, 3]") from error
+    for overlay, size in zip(overlays, sizes, strict=True):
+        if (overlay.height, overlay.width) != size:
+            raise InputError(
+                f"{path} has layers of {overlay.height} x {overlay.width} pixels, the undistorted photos have {size[0]} "
+                f"x {size[1]}",
+                "give the layers in the undistorted frame at the training resolution",
+            )
+    return overlays
+
+
+def _look_at(photos: list[dict[str, Any]], name: str) -> ImageStatistics:
+    views = ((photo["image"], photo.get("mask")) for photo in photos)
+    return accumulate(track(views, f"Looking at {name}", total=len(photos), transient=True))
+
+
+def _found(detection: Detection, name: str) -> bool:
+    """Say in one line what was found, and how to have it otherwise."""
+    if detection.verdict != "none":
+        CONSOLE.print(
+            f"{name[0].upper()}{name[1:]} have a static artifact in front ({detection.verdict}, "
+            f"{detection.coverage:.1%} of the frame): it is learned. (--pipeline.model.overlay off: it is not.)"
+        )
+        return True
+    reason = "too few to tell" if detection.views < LEAST_VIEWS else f"p = {detection.p_value:.2g}"
+    reason += ", too few static edges to report" if detection.slight else ""
+    CONSOLE.print(
+        f"{name[0].upper()}{name[1:]} show no static artifact ({detection.views} views, {reason}): training without an "
+        "overlay. (--pipeline.model.overlay on: with one.)"
+    )
+    return False

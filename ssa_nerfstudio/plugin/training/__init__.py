@@ -1,0 +1,1 @@
+"""Trainer, optimizers, densification, schedules and checkpoints."""

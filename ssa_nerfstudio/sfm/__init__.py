@@ -1,0 +1,1 @@
+"""Photos and videos to a nerfstudio dataset, in spite of a static artifact."""

@@ -1,0 +1,152 @@
+"""Structure from motion with pycolmap; features and matches go on where they were interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+
+import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, saving a PNG aborts the process
+import pycolmap
+
+from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
+from ssa_nerfstudio.sfm.reconstruction import JOB, MODEL, Pass, Report, Settings
+
+_PAIRS_A_CALL = 64
+"""Matched and stored together: what a kill can cost, and how often the progress bar moves."""
+_PHOTOS_A_THREAD = 2
+
+pycolmap.logging.minloglevel = 3
+
+
+class Structure:
+    """A database of features and matches in a folder of its own, and what is mapped from it."""
+
+    def __init__(self, images: Path, passes: Sequence[Pass], folder: Path, settings: Settings) -> None:
+        """Take what to work on.
+
+        Args:
+            images: folder of the photos.
+            passes: each has one camera of its own; all are mapped together.
+            folder: exists; what an earlier run with the same arguments left there is used.
+            settings: how.
+        """
+        self._images, self._passes, self._folder, self._settings = images, passes, folder, settings
+        self._database = folder / "database.db"
+
+    def extract(self, report: Report) -> None:
+        """Finds SIFT features in all photos that have none yet; one OPENCV camera a pass."""
+        options = pycolmap.FeatureExtractionOptions()
+        options.num_threads = self._settings.threads
+        options.max_image_size = self._settings.max_image_size
+        total = sum(len(each.photos) for each in self._passes)
+        with pycolmap.Database.open(self._database) as database:
+            known = {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
+        for number, each in enumerate(self._passes, 1):
+            reader = pycolmap.ImageReaderOptions()
+            reader.camera_model = "OPENCV"
+            if each.mask is not None:
+                reader.camera_mask_path = each.mask
+            with pycolmap.Database.open(self._database) as database:
+                if not database.exists_camera(number):
+                    camera = pycolmap.infer_camera_from_image(self._images / each.photos[0], reader)
+                    camera.camera_id = number
+                    database.write_camera(camera, use_camera_id=True)
+            reader.existing_camera_id = number
+            left = iter([name for name in each.photos if name not in known])
+            while names := list(islice(left, _PHOTOS_A_THREAD * self._threads)):
+                report("features", len(known), total)
+                pycolmap.extract_features(
+                    self._database,
+                    each.folder,
+                    image_names=names,
+                    reader_options=reader,
+                    extraction_options=options,
+                )
+                known |= {*names}
+        report("features", total, total)
+
+    def match(self, report: Report) -> None:
+        """Matches and verifies all pairs that have not been matched yet."""
+        matching = pycolmap.FeatureMatchingOptions()
+        matching.num_threads = self._settings.threads
+        geometry = pycolmap.TwoViewGeometryOptions()
+        geometry.filter_stationary_matches = self._settings.filter_stationary
+        geometry.ransac.random_seed = 0
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = self._folder / "pairs.txt"
+        pairs = self._pairs()
+        with pycolmap.Database.open(self._database) as database:
+            ids = {image.name: image.image_id for image in database.read_all_images()}
+            left = [pair for pair in pairs if not database.exists_two_view_geometry(*(ids[n] for n in pair))]
+        done = len(pairs) - len(left)
+        batches = iter(left)
+        while batch := list(islice(batches, _PAIRS_A_CALL)):
+            report("matches", done, len(pairs))
+            Path(pairing.match_list_path).write_text("".join(f"{one} {other}\n" for one, other in batch))
+            pycolmap.match_image_pairs(self._database, matching, pairing, geometry)
+            done += len(batch)
+        report("matches", len(pairs), len(pairs))
+
+    def map(self, report: Report) -> None:
+        """Maps incrementally and stores the reconstruction with most photos; none where no two photos match."""
+        total = sum(len(each.photos) for each in self._passes)
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = self._settings.threads
+        options.random_seed = 0
+        # A capture of few photos is whole although it is smaller than what COLMAP would keep.
+        options.min_model_size = min(10, max(3, total // 2))
+        models = self._folder / "models"
+        for earlier in (models, self._folder / MODEL):
+            shutil.rmtree(earlier, ignore_errors=True)
+        models.mkdir()
+        registered = 2
+
+        def on_photo() -> None:
+            nonlocal registered
+            registered += 1
+            report("poses", min(registered, total), total)
+
+        report("poses", 0, total)
+        found = pycolmap.incremental_mapping(
+            self._database, self._images, models, options, next_image_callback=on_photo
+        )
+        if found:
+            (self._folder / MODEL).mkdir()
+            max(found.values(), key=lambda model: model.num_reg_images()).write_binary(self._folder / MODEL)
+        report("poses", total, total)
+
+    def _pairs(self) -> list[tuple[str, str]]:
+        photos = [each.photos for each in self._passes]
+        exhaustive = self._settings.matching == "exhaustive" or (
+            self._settings.matching == "auto" and sum(map(len, photos)) <= EXHAUSTIVE_UP_TO
+        )
+        return exhaustive_pairs(photos) if exhaustive else sequential_pairs(photos)
+
+    @property
+    def _threads(self) -> int:
+        return self._settings.threads if self._settings.threads > 0 else os.cpu_count() or 1
+
+
+def _main(folder: Path) -> None:
+    """The child process of `apart.reconstruct`: reports as lines of JSON, and ends when its parent does."""
+
+    def report(*what: str | int) -> None:
+        print(json.dumps(what), flush=True)
+
+    end_with_parent()
+    told = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    passes = [Pass(**each) for each in told["passes"]]
+    structure = Structure(Path(told["images"]), passes, folder, Settings(**told["settings"]))
+    structure.extract(report)
+    structure.match(report)
+    structure.map(report)
+
+
+if __name__ == "__main__":
+    _main(Path(sys.argv[1]))

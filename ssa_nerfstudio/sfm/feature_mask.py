@@ -1,0 +1,75 @@
+"""The mask of a pass: where structure from motion looks, and where the artifact is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from PIL import Image
+
+from ssa_nerfstudio.errors import InputError
+
+_LEAST_OPEN = 0.05
+"""Share of the frame that a mask must leave open: less is a mask of the other polarity, or of no use."""
+_MARGIN = 0.01
+"""Widening of the masked part, relative to the frame's longer side: descriptors reach beyond their point."""
+
+
+def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np.ndarray:
+    """Reads a mask in the polarity that COLMAP and nerfstudio share: black (0) is ignored, all else is used.
+
+    Args:
+        path: a picture of the raw frame's shape; one of another size is scaled, nearest neighbour.
+        width, height: of the photos, pixels.
+        inverted: whether white marks the artifact instead.
+
+    Returns:
+        bool [height, width], True where photos are used.
+
+    Raises:
+        InputError: it cannot be read, is of another shape, or leaves less than 5 % of the frame.
+    """
+    try:
+        with Image.open(path) as image:
+            grey = np.asarray(image.convert("L"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise InputError(
+            f"{path} cannot be read as a mask ({error})", "give a picture, black where to ignore"
+        ) from error
+    # A mask learned at a reduced size has rounded sides.
+    if abs(grey.shape[1] * height - grey.shape[0] * width) > max(width, height):
+        raise InputError(
+            f"{path} is {grey.shape[1]} x {grey.shape[0]}, the photos are {width} x {height}",
+            "give a mask of the raw frame",
+        )
+    used = (grey > 0) != inverted
+    if used.shape != (height, width):
+        used = cv2.resize(used.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    return checked(used, str(path))
+
+
+def checked(used: np.ndarray, name: str) -> np.ndarray:
+    """The mask itself, if it leaves enough of the frame.
+
+    Args:
+        used: bool [H, W], True where photos are used.
+        name: what the message calls it.
+
+    Raises:
+        InputError: it leaves less than 5 % of the frame.
+    """
+    if used.mean() < _LEAST_OPEN:
+        raise InputError(
+            f"{name} leaves {used.mean():.1%} of the frame: black is ignored",
+            "add --invert-mask if white marks the artifact",
+        )
+    return used
+
+
+def widened(used: np.ndarray) -> np.ndarray:
+    """The mask with its masked part widened by 1 % of the longer side, against features that look across its edge."""
+    margin = max(1, round(_MARGIN * max(used.shape)))
+    element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+    # Outside the frame nothing is masked: erosion must not eat in from the border.
+    return cv2.erode(used.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=(1,)) > 0

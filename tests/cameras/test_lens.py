@@ -1,0 +1,180 @@
+"""The warp between raw and undistorted frame, against nerfstudio's own."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nerfstudio.cameras.camera_utils import get_distortion_params
+from nerfstudio.cameras.cameras import Cameras, CameraType
+from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
+from PIL import Image
+
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistort, undistorted
+from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS, effect_class
+from ssa_nerfstudio.experiments.effects.composition import Composition
+from ssa_nerfstudio.experiments.simulation.corruption import undistorted_layers
+
+GOPRO_LIKE = Lens(212, 120, 110.0, 103.0, 106.0, 60.0, (-0.18, 0.024, 0, 0, 0.0005, 0.0008))
+DEVIATION = {"rain": 16.0, "mud": 2.5}
+"""Grey levels by which 99.9 % of all pixels deviate at most; 1.5 for the other effects."""
+
+
+def by_nerfstudio(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """nerfstudio's K [3, 3] (its own convention) and undistorted picture."""
+    kind = CameraType.FISHEYE if lens.model == "fisheye" else CameraType.PERSPECTIVE
+    distortion = get_distortion_params(**dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), lens.distortion, strict=True)))
+    camera = Cameras(
+        torch.eye(4)[None, :3],
+        *(lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height),
+        distortion_params=distortion,
+        camera_type=kind,
+    )[0].reshape(())
+    intrinsics = camera.get_intrinsics_matrices().numpy()
+    matrix, warped, _ = _undistort_image(camera, distortion.numpy(), {}, image, intrinsics)
+    return matrix, warped
+
+
+def check_against_nerfstudio(image: np.ndarray, lens: Lens) -> None:
+    matrix, warped = by_nerfstudio(image, lens)
+    if not np.isfinite(matrix).all() or not warped.size:
+        with pytest.raises(ValueError, match=r"folds its frame|leaves no pixel"):
+            undistort(image, lens)
+        return
+    ours, target = undistort(image, lens), undistorted(lens)
+    assert np.array_equal(ours, warped)
+    assert ours.shape[:2] == (target.height, target.width)
+    stated = (target.fx, target.fy, target.cx, target.cy)
+    assert stated == pytest.approx((matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]), rel=1e-6)
+
+
+def gopro_walk(captures: Path) -> tuple[np.ndarray, Lens]:
+    """Its first photo and its lens."""
+    meta = json.loads((captures / "gopro_walk/transforms.json").read_text())
+    distortion = tuple(meta.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    lens = Lens(*(meta[key] for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")), distortion=distortion)
+    return np.asarray(Image.open(captures / "gopro_walk" / meta["frames"][0]["file_path"])), lens
+
+
+def test_real_photos_come_out_as_nerfstudio_undistorts_them(captures):
+    photo, lens = gopro_walk(captures)
+    check_against_nerfstudio(photo, lens)
+    check_against_nerfstudio(photo.astype(np.float32) / 255, lens)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    size=st.tuples(st.integers(30, 120), st.integers(30, 120)),
+    focal=st.floats(0.5, 2),
+    centre=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+    coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 2, *[st.floats(-0.01, 0.01)] * 2),
+    fisheye=st.booleans(),
+)
+def test_any_lens_comes_out_as_in_nerfstudio(size, focal, centre, coefficients, fisheye):
+    k1, k2, p1, p2 = coefficients
+    (width, height), (x, y) = size, centre
+    middle = (width / 2 + x, height / 2 + y)
+    focals = (focal * width, focal * width * 0.97)
+    if fisheye:
+        lens = Lens(width, height, *focals, *middle, (k1, k2, p1, p2, 0, 0), "fisheye")
+    else:
+        lens = Lens(width, height, *focals, *middle, (k1, k2, 0, 0, p1, p2))
+    if lens.distorted:
+        check_against_nerfstudio(np.random.default_rng(0).integers(0, 256, (height, width, 3), dtype=np.uint8), lens)
+
+
+def test_a_fisheye_that_folds_its_frame_is_refused():
+    lens = Lens(30, 30, 15.0, 14.55, 15.0, 15.0, (0.0, -0.125, 0.0, 0.0, 0.0, 0.0), "fisheye")
+    with pytest.raises(ValueError, match="folds its frame"):
+        undistorted(lens)
+
+
+def test_without_distortion_nothing_is_touched():
+    lens = Lens(20, 10, 30, 30, 9, 4)
+    image = np.random.default_rng(0).random((10, 20, 3), dtype=np.float32)
+    assert undistorted(lens) == lens
+    assert undistort(image, lens) is image
+    assert distort(image, lens, fill=0.0) is image
+
+
+@pytest.mark.parametrize("model", ["perspective", "fisheye"])
+def test_distort_is_the_inverse_of_undistort(model):
+    lens = Lens(212, 120, 110.0, 103.0, 106.0, 60.0, (-0.1, 0.01, 0, 0, 0, 0), model)
+    y, x = np.mgrid[:120, :212].astype(np.float32)
+    smooth = np.stack([np.sin(x / 20), np.cos(y / 15), np.ones_like(x)], axis=-1)
+    back = distort(undistort(smooth, lens), lens, fill=np.nan)
+    # Where both warps had four pixels to interpolate between.
+    known = back[..., 2] > 0.999
+    assert known.mean() > 0.7
+    assert np.abs(back - smooth)[known].max() < 0.01
+
+
+@pytest.mark.parametrize("channels", [(), (1,), (2,), (3,), (4,)])
+@pytest.mark.parametrize("model", ["perspective", "fisheye"])
+def test_both_warps_keep_the_channels(channels, model):
+    lens = Lens(53, 30, 28.0, 26.0, 26.0, 15.0, (-0.1, 0.01, 0, 0, 0, 0), model)
+    target = undistorted(lens)
+    raw = np.random.default_rng(0).random((30, 53, *channels), dtype=np.float32)
+    straight = undistort(raw, lens)
+    assert straight.shape == (target.height, target.width, *channels)
+    assert distort(straight, lens, fill=0.0).shape == raw.shape
+
+
+def test_a_cropped_corner_is_filled():
+    target = undistorted(GOPRO_LIKE)
+    ones = np.ones((target.height, target.width, 3), np.float32)
+    raw = distort(ones, GOPRO_LIKE, fill=0.5)
+    assert raw[60, 106] == pytest.approx([1, 1, 1])
+    assert raw[0, 0] == pytest.approx([0.5, 0.5, 0.5])
+
+
+@pytest.mark.parametrize("effect", EFFECTS)
+def test_undistorted_layers_form_the_undistorted_photo(effect, captures):
+    """Bilinear averages of T C + B are not those of T and C; clipping comes before the warp in the photo."""
+    photo, lens = gopro_walk(captures)
+    artifact = Composition([effect_class(effect)().layers(lens.height, lens.width, np.random.default_rng(0))])
+    inside = None if artifact.box is None else artifact.view([np.random.default_rng(1)])
+    seen = undistort(artifact.apply(photo, inside), lens)
+    layers = undistorted_layers(artifact.whole(inside, lens.height, lens.width), lens)
+    formed = (layers.transmittance * (undistort(photo, lens) / 255) + layers.addition).clip(0, 1) * 255
+    deviation = np.abs(seen - formed)
+    assert deviation.mean() < 0.5
+    assert np.percentile(deviation, 99.9) < DEVIATION.get(effect, 1.5)
+
+
+def test_straight_colour_must_not_be_warped():
+    """Why the layers are premultiplied: a white disc on black ground keeps its edge white."""
+    y, x = np.mgrid[:120, :212]
+    matte = (np.hypot(x - 40, y - 40) < 20).astype(np.float32)[..., None]
+    addition = np.repeat(matte, 3, axis=2)
+    warped_matte, warped = undistort(1 - addition, GOPRO_LIKE), undistort(addition, GOPRO_LIKE)
+    edge = (warped_matte > 0.1) & (warped_matte < 0.9)
+    assert edge.any()
+    assert np.allclose(warped[edge] / (1 - warped_matte[edge]), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"width": 0}, "at least 1 x 1"),
+        ({"fx": float("nan")}, "finite"),
+        ({"distortion": (0.1,)}, "k1, k2, k3, k4, p1, p2"),
+        ({"distortion": (0.1, 0, 0, 0.2, 0, 0)}, "no perspective camera with k4"),
+    ],
+)
+def test_lenses_that_cannot_be_are_refused(fields, message):
+    stated = {"width": 20, "height": 10, "fx": 30.0, "fy": 30.0, "cx": 9.0, "cy": 4.0} | fields
+    with pytest.raises(ValueError, match=message):
+        Lens(**stated)
+
+
+def test_pictures_of_another_size_are_refused():
+    with pytest.raises(ValueError, match="image is 5 x 4, the lens' frame 212 x 120"):
+        undistort(np.zeros((4, 5, 3), np.uint8), GOPRO_LIKE)
+    with pytest.raises(ValueError, match="image is 212 x 120, the lens' frame"):
+        distort(np.zeros((120, 212, 3), np.uint8), GOPRO_LIKE, fill=0.0)

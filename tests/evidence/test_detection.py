@@ -1,0 +1,305 @@
+"""Detection on captures made to be told apart: what is static to the pixel is found, what merely recurs is not."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from ssa_nerfstudio.evidence import detection
+from ssa_nerfstudio.evidence.detection import detect, static_area
+from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
+
+HEIGHT, WIDTH = 96, 128
+
+
+def texture(rng: np.random.Generator, size: int) -> np.ndarray:
+    """Noise with structure at all scales, [size, size, 3] in [0, 1]."""
+    total = np.zeros((size, size, 3))
+    for cells in (4, 16, 64, size):
+        coarse = rng.random((cells, cells, 3))
+        total += np.kron(coarse, np.ones((size // cells, size // cells, 1)))
+    return (total - total.min()) / np.ptp(total)
+
+
+def capture(views: int, seed: int = 0) -> list[np.ndarray]:
+    """Photos of a textured wall from changing places, uint8."""
+    rng = np.random.default_rng(seed)
+    wall = texture(rng, 512)
+    corners = rng.integers(0, 512 - max(HEIGHT, WIDTH), (views, 2))
+    return [(wall[y : y + HEIGHT, x : x + WIDTH] * 255).round().astype(np.uint8) for y, x in corners]
+
+
+def behind(photos: list[np.ndarray], alpha: np.ndarray, color: float = 0.9) -> list[np.ndarray]:
+    """The same with a layer of this matte [H, W] in front."""
+    alpha = alpha[..., None]
+    return [(photo * (1 - alpha) + 255 * color * alpha).round().astype(np.uint8) for photo in photos]
+
+
+def statistics_of(photos: list[np.ndarray]) -> ImageStatistics:
+    return accumulate((torch.from_numpy(photo), None) for photo in photos)
+
+
+def logo(alpha: float) -> np.ndarray:
+    matte = np.zeros((HEIGHT, WIDTH))
+    for x in range(30, 100, 12):
+        matte[40:56, x : x + 6] = alpha
+    return matte
+
+
+def board() -> np.ndarray:
+    matte = np.zeros((HEIGHT, WIDTH))
+    matte[70:] = 1.0
+    return matte
+
+
+@pytest.mark.parametrize("views", [12, 25, 50])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_capture_without_artifact_raises_no_alarm(views, seed):
+    found = detect(statistics_of(capture(views, seed)))
+    assert found.verdict == "none"
+    assert found.coverage == 0
+    assert not found.mask.any()
+
+
+@pytest.mark.parametrize("views", [12, 25, 50])
+def test_a_faint_logo_is_found_where_it_is(views):
+    found = detect(statistics_of(behind(capture(views), logo(0.4))))
+    assert found.verdict == "faint"
+    assert found.views == views
+    assert found.p_value == 1 / (1 + detection.DRAWS)
+    assert found.mask[40:56, 30:96].float().mean() > 0.5
+    away = found.mask.clone()
+    away[36:60, 26:100] = False
+    assert away.float().mean() < 0.01
+    assert found.coverage == pytest.approx(float(found.mask.float().mean()))
+
+
+def test_an_opaque_board_is_found_with_its_plain_inside():
+    found = detect(statistics_of(behind(capture(25), board())))
+    assert found.verdict == "opaque"
+    assert found.mask[72:].all()
+    assert found.mask[:66].float().mean() < 0.01
+
+
+@pytest.mark.parametrize("views", [12, 40])
+def test_a_plain_corner_is_found_though_it_has_few_edges(views):
+    """A thumb, a tripod's leg: 6 % of the frame, whose edges alone would be too few to report."""
+    matte = np.zeros((480, 640))
+    matte[360:, :160] = 1.0
+    photos = behind([cv2.resize(photo, (640, 480)) for photo in capture(views)], matte)
+    found = detect(statistics_of(photos))
+    assert detection._strength(found.shares) < 1
+    assert found.verdict == "opaque"
+    assert found.mask[362:, :158].all()
+    assert found.coverage == pytest.approx(0.0625, abs=0.02)
+
+
+def test_a_plain_sky_without_static_edges_is_no_artifact():
+    """All views agree on the upper half; its lower border moves, as a skyline does. The board below does not."""
+    photos = behind(capture(30), board())
+    rng = np.random.default_rng(5)
+    for photo in photos:
+        rows = 40 + np.round(6 * np.sin(np.arange(WIDTH) / 9 + rng.uniform(0, 6)) + rng.uniform(-6, 6)).astype(int)
+        photo[np.arange(HEIGHT)[:, None] < rows] = (140, 170, 230)
+    statistics = statistics_of(photos)
+    assert float(statistics.deviation()[:24].max()) == 0
+    assert not static_area(statistics).inside[:24].any()
+    assert static_area(statistics).inside[72:].all()
+    assert not detect(statistics).mask[:24].any()
+
+
+def test_what_never_changes_is_spared_without_static_edges_unless_it_is_clipped(monkeypatch):
+    """With few views a plain board's edge is not significant; but no scene is the same to the last bit."""
+    monkeypatch.setattr("ssa_nerfstudio.evidence.detection.LEAST_SHARES", (1.0, 1.0))
+    monkeypatch.setattr("ssa_nerfstudio.evidence.detection.LEAST_PLAIN", 1.0)
+    photos = capture(8)
+    for photo in photos:
+        photo[:, :20], photo[:, 20:40] = (200, 120, 30), 255
+    area = static_area(statistics_of(photos))
+    assert area.inside[:, :20].all()
+    assert not area.inside[:, 20:].any()
+    white = static_area(statistics_of([np.full_like(photo, 255) for photo in photos]))
+    assert white.inside.all(), "of a frame that never changes anywhere there is nothing else to say"
+
+
+def test_without_static_edges_nothing_is_spared_and_without_views_all_is():
+    """Where nothing static was found, none is likely; six views and fewer say nothing, as in the paper all may be."""
+    found, unknown = static_area(statistics_of(capture(30))), static_area(statistics_of(capture(4)))
+    assert not found.inside.any()
+    assert not found.near.any()
+    assert not found.adds_light
+    assert unknown.inside.all()
+    assert unknown.near.all()
+
+
+def test_what_recurs_without_staying_in_place_is_no_artifact():
+    """A dark square in the middle of every view, as when walking around something: never twice at the same pixels."""
+    photos = capture(40)
+    rng = np.random.default_rng(1)
+    for photo in photos:
+        y, x = rng.integers(20, 40), rng.integers(30, 60)
+        photo[y : y + 30, x : x + 30] //= 3
+    assert detect(statistics_of(photos)).verdict == "none"
+
+
+def distant(views: int, seed: int = 0) -> list[np.ndarray]:
+    """Photos of soft clouds from a hand that trembles by up to two pixels, uint8."""
+    rng = np.random.default_rng(seed)
+    clouds = cv2.GaussianBlur(rng.random((HEIGHT + 8, WIDTH + 8, 3)), (0, 0), 4)
+    clouds = (clouds - clouds.min()) / np.ptp(clouds)
+    photos = []
+    for x, y in rng.uniform(2, 6, (views, 2)):
+        place = np.array([[1.0, 0.0, x], [0.0, 1.0, y]])
+        moved = cv2.warpAffine(clouds, place, (WIDTH, HEIGHT), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+        photos.append((255 * moved + rng.normal(0, 1, moved.shape)).round().clip(0, 255).astype(np.uint8))
+    return photos
+
+
+@pytest.mark.parametrize("views", [8, 12, 40])
+def test_what_trembles_together_is_no_artifact_though_its_edges_hardly_move(views, monkeypatch):
+    statistics = statistics_of(distant(views))
+    found = detect(statistics)
+    assert found.verdict == "none"
+    assert max(found.shares) < 0.003
+    assert not static_area(statistics).near.any()
+    monkeypatch.setattr(detection, "DISPLACED_SHARES", (1.0, 1.0))
+    assert detect(statistics).verdict != "none", "without a look at displacements it would be one"
+
+
+@pytest.mark.parametrize("views", [8, 12, 40])
+def test_in_front_of_what_trembles_an_artifact_is_found(views):
+    photos = distant(views)
+    panel = texture(np.random.default_rng(1), 128)[: HEIGHT - 70] * 255
+    for photo in photos:
+        photo[70:] = panel
+    found = detect(statistics_of(photos))
+    assert found.verdict == "opaque"
+    assert found.mask[72:].float().mean() > 0.9
+
+
+def test_a_displaced_picture_is_told_from_one_that_something_else_passes_behind():
+    """Moved clouds deviate by displacement alone; of noise, chance explains two of 21 x 21 pixels; exposure is none."""
+    rng = np.random.default_rng(0)
+    clouds = cv2.GaussianBlur(rng.random((HEIGHT, WIDTH)), (0, 0), 5)
+    clouds = torch.from_numpy((clouds - clouds.min()) / np.ptp(clouds)).float()
+    down, right = torch.gradient(clouds)
+    along, across = torch.from_numpy(rng.normal(size=(2, 12, 1, 1))).float()
+    gains = torch.linspace(-0.2, 0.2, 12)[:, None, None]
+    noise = torch.from_numpy(rng.normal(0, 0.1, (12, HEIGHT, WIDTH))).float()
+    gradient = torch.stack([right, down])
+    for deviations, low, high in (
+        (along * right + across * down, 0.9, 1.0),
+        (noise, 0.0, 0.02),
+        (gains * clouds, 0.0, 0.02),
+    ):
+        share = detection._displaced_share(clouds + deviations - deviations.mean(dim=0), gradient, 21)
+        assert low <= float(share[12:-12, 12:-12].median()) <= high
+
+
+def test_edges_that_hang_together_stay_if_a_tenth_of_them_is_still():
+    edges = np.zeros((9, 40), np.uint8)
+    edges[2, 2:22] = edges[6, 2:22] = 1
+    still = np.zeros((9, 40), bool)
+    still[2, 20:22] = still[6, 21] = True
+    settled = detection._settled(edges, still)
+    assert (settled[2] == edges[2]).all()
+    assert not settled[6].any()
+
+
+def test_vignetting_alone_is_smooth_and_raises_no_alarm():
+    y, x = np.mgrid[-1 : 1 : HEIGHT * 1j, -1 : 1 : WIDTH * 1j]
+    fall = 1 - 0.15 * (x**2 + y**2)
+    photos = [(photo * fall[..., None]).astype(np.uint8) for photo in capture(40)]
+    assert detect(statistics_of(photos)).verdict == "none"
+
+
+def test_below_the_faintest_gradient_nothing_counts():
+    """A pattern of one grey level on equal photos: all views agree to the bit, and nobody could see it."""
+    photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
+    photo[::2] += 1
+    assert detect(statistics_of([photo] * 20)).verdict == "none"
+
+
+def test_identical_photos_are_all_artifact():
+    """Nothing moves: the camera stood still, and neither poses nor an overlay can be told from them."""
+    found = detect(statistics_of(capture(1) * 20))
+    assert found.verdict == "opaque"
+    assert found.coverage > 0.9
+
+
+def test_too_few_views_give_no_verdict():
+    found = detect(statistics_of(behind(capture(5), board())))
+    assert found.verdict == "none"
+    assert found.p_value == 1.0
+    assert found.p_interval == (0.0, 1.0)
+
+
+def test_the_same_seed_gives_the_same_and_global_random_state_is_left_alone():
+    statistics = statistics_of(behind(capture(12), logo(0.2)))
+    torch.manual_seed(1)
+    np.random.seed(1)  # noqa: NPY002 - the state that must not change
+    before = torch.get_rng_state()
+    first, second = detect(statistics), detect(statistics)
+    assert torch.equal(before, torch.get_rng_state())
+    after = np.random.random(3)  # noqa: NPY002
+    np.random.seed(1)  # noqa: NPY002
+    assert (after == np.random.random(3)).all()  # noqa: NPY002
+    assert first.null_shares == second.null_shares
+    assert torch.equal(first.mask, second.mask)
+    assert detect(statistics, seed=1).verdict == first.verdict
+
+
+def test_what_masks_hide_makes_no_edge():
+    """Black below a user's mask that is the same in all views: its outline must not be taken for an artifact."""
+    seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    seen[60:, 20:80] = False
+    found = detect(accumulate((torch.from_numpy(photo), seen) for photo in capture(25)))
+    assert found.verdict == "none"
+    found = detect(accumulate((torch.from_numpy(photo), seen) for photo in behind(capture(25), logo(0.4))))
+    assert found.verdict == "faint"
+
+
+def test_masks_that_differ_from_view_to_view_make_no_edge():
+    rng = np.random.default_rng(0)
+    views = []
+    for photo in capture(25):
+        y, x = rng.integers(0, 60, 2)
+        seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+        seen[y : y + 30, x : x + 40] = False
+        views.append((torch.from_numpy(photo), seen))
+    assert detect(accumulate(views)).verdict == "none"
+
+
+def test_the_type_of_the_photos_changes_nothing():
+    photos = behind(capture(16), logo(0.4))
+    bytes_, words, floats = (
+        accumulate((torch.from_numpy(convert(photo)), None) for photo in photos)
+        for convert in (lambda p: p, lambda p: p.astype(np.uint16) * 257, lambda p: p.astype(np.float32) / 255)
+    )
+    assert torch.allclose(detect(bytes_).evidence, detect(words).evidence, rtol=1e-3, atol=1e-3)
+    assert torch.allclose(detect(bytes_).evidence, detect(floats).evidence, rtol=1e-3, atol=1e-3)
+
+
+@settings(max_examples=20, deadline=None)
+@given(height=st.integers(1, 40), width=st.integers(1, 40), views=st.integers(1, 20))
+def test_any_frame_and_number_of_views_gives_a_mask_of_its_size(height, width, views):
+    rng = np.random.default_rng(height * 41 + width)
+    photos = [torch.from_numpy(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)) for _ in range(views)]
+    statistics = accumulate((photo, None) for photo in photos)
+    found = detect(statistics, draws=5)
+    area = static_area(statistics)
+    assert found.mask.shape == area.inside.shape == area.near.shape == (height, width)
+    assert 0 < found.p_value <= 1
+    low, high = found.p_interval
+    assert 0 <= low < high <= 1
+
+
+def test_the_interval_is_clopper_pearsons():
+    """0 of 200: 1 - 0.025 ** (1 / 200); 200 of 200 mirrored; in between against tabulated values."""
+    assert detection._interval(0, 200) == pytest.approx((0.0, 1 - 0.025 ** (1 / 200)))
+    assert detection._interval(200, 200) == pytest.approx((0.025 ** (1 / 200), 1.0))
+    assert detection._interval(5, 20) == pytest.approx((0.0866, 0.4910), abs=1e-4)

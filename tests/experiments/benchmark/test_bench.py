@@ -1,0 +1,279 @@
+"""`ssa bench` around its runs: selection, expectations, time limits, locks, clusters, refusals."""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from conftest import at_work
+from made_results import benchmark, folder_of, result
+
+from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.experiments.benchmark.execution.execute import Expectation, select
+from ssa_nerfstudio.experiments.benchmark.execution.local_runner import Local
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
+from ssa_nerfstudio.experiments.benchmark.execution.run_process import REQUEST, Request
+from ssa_nerfstudio.experiments.benchmark.results import read_all
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
+
+SSA = (sys.executable, "-m", "ssa_nerfstudio")
+
+SHORT = """
+scenes:
+  - data: demo
+    model: {num_downscales: 0}
+parts:
+  - {methods: [3dgs], effects: [none], steps: 5}
+"""
+
+
+def ssa(*arguments: str | Path) -> subprocess.CompletedProcess:
+    return subprocess.run([*SSA, *arguments], capture_output=True, text=True, timeout=300)
+
+
+def test_scenes_and_patterns_select_runs():
+    runs = plan(benchmark())
+    chosen = select(runs, ("barn",), ("*-mud-given-*", "*-none-3dgs-adc-*"))
+    assert {(run.scene, run.effect, run.method) for run in chosen} == {
+        ("barn", "mud", "given"),
+        ("barn", "none", "3dgs"),
+    }
+    assert select(runs, (), ()) == runs
+
+
+def test_a_run_takes_as_long_as_those_like_it():
+    runs = plan(benchmark())
+    known = [result(run) for run in runs if run.scene == "attic" and run.densification == "adc"]
+    expected = Expectation(known)
+    assert Expectation([]).seconds(runs[0]) is None
+    assert expected.seconds(runs[0]) == pytest.approx(8 + 700 / 100)
+    longer = dataclasses.replace(runs[0], steps=7000)
+    assert expected.seconds(longer) == pytest.approx(8 + 7000 / 100)
+    elsewhere = next(run for run in runs if run.scene == "barn" and run.densification == "mcmc")
+    assert expected.seconds(elsewhere) == pytest.approx(15)
+    slow = result(elsewhere, seconds={"startup": 5, "statistics": 1, "training": 70, "evaluation": 2})
+    assert Expectation([*known, slow]).seconds(elsewhere) == pytest.approx(78)
+
+
+def test_no_run_is_started_that_would_not_end_in_time(tmp_path):
+    runs = plan(read_benchmark("smoke"))
+    slow = {"startup": 5.0, "statistics": 0.0, "training": 5000.0, "evaluation": 1.0}
+    folder_of(tmp_path, [result(runs[0], seconds=slow)])
+    (tmp_path / "scenes").mkdir()
+    for run in runs:
+        (tmp_path / "scenes" / run.dataset).mkdir(exist_ok=True)
+    done = ssa("bench", "smoke", "--output", tmp_path, "--time-limit", "10")
+    assert done.returncode == 0, done.stderr
+    assert "4 of 5 runs are left; call the same again to go on" in done.stdout
+    assert not (tmp_path / "logs").exists()
+
+
+def test_what_runs_at_the_time_limit_is_stopped_and_leaves_nothing(tmp_path):
+    started = time.monotonic()
+    done = ssa("bench", "smoke", "--output", tmp_path, "--only", "*-none-3dgs-*", "--time-limit", "0.05")
+    assert done.returncode == 0, done.stderr
+    assert "1 of 1 runs are left" in done.stdout
+    assert time.monotonic() - started < 120
+    assert read_all([tmp_path]) == ([], [])
+    assert at_work(tmp_path) == []
+    assert ssa("bench", "smoke", "--output", tmp_path, "--list").stdout.count("to do") == 5
+
+
+def test_a_run_that_failed_is_done_again(tmp_path):
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    (run,) = plan(read_benchmark(str(path)))
+    folder = folder_of(tmp_path / "out", [result(run, status="failed", reason="the machine caught fire")])
+    main(["bench", str(path), "--output", str(folder)])
+    assert [each.status for each in read_all([folder])[0]] == ["finished"]
+
+
+def test_results_of_other_folders_are_taken_over(tmp_path, capsys):
+    runs = plan(read_benchmark("smoke"))
+    folder_of(tmp_path / "there", [result(run) for run in runs])
+    main(["bench", "smoke", "--output", str(tmp_path / "here"), "--merge", str(tmp_path / "there")])
+    assert "All smoke runs" in capsys.readouterr().out
+    assert len(read_all([tmp_path / "here"])[0]) == 5
+
+
+def test_one_training_answers_for_every_name_it_goes_by(tmp_path, capsys):
+    path = tmp_path / "twice.yaml"
+    path.write_text(
+        "scenes: [{data: demo, model: {num_downscales: 0}}]\n"
+        "parts: [{methods: [paper, l1-0.05, l1-0.01], effects: [dashboard], steps: 5}]"
+    )
+    runs = {run.method: run for run in plan(read_benchmark(str(path)))}
+    assert runs["paper"].training == runs["l1-0.05"].training
+    assert runs["paper"].training != runs["l1-0.01"].training
+    known = folder_of(tmp_path / "out", [result(runs["l1-0.01"])])
+    (known / "pictures" / runs["l1-0.01"].id).mkdir(parents=True)
+    main(["bench", str(path), "--output", str(known), "--only", "*-paper-adc-*", "*-l1-0.05-*"])
+    found = {each.run.method: each for each in read_all([known])[0]}
+    assert set(found) == {"paper", "l1-0.05", "l1-0.01"}
+    assert (found["paper"].same_as, found["l1-0.05"].same_as) == ("", runs["paper"].id)
+    assert found["paper"].views == found["l1-0.05"].views != {}
+    pictures = [sorted(p.name for p in (known / "pictures" / runs[m].id).iterdir()) for m in ("paper", "l1-0.05")]
+    assert pictures[0] == pictures[1] != []
+    # Known from an earlier call: nothing is trained at all.
+    (known / "results" / f"{runs['paper'].id}.json").unlink()
+    shutil.rmtree(known / "scenes")
+    main(["bench", str(path), "--output", str(known), "--only", "*-paper-adc-*"])
+    assert {each.run.method for each in read_all([known])[0]} == set(found)
+    assert not (known / "scenes").exists()
+
+
+def test_what_a_training_leaves_undone_is_left_under_each_of_its_names(tmp_path):
+    path = tmp_path / "twice.yaml"
+    path.write_text("scenes: [{data: demo}]\nparts: [{methods: [paper, l1-0.05], effects: [dashboard], steps: 5}]")
+    done = ssa("bench", path, "--output", tmp_path / "out", "--time-limit", "0.001")
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 runs are left" in done.stdout
+
+
+def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monkeypatch, capsys):
+    path = tmp_path / "rain.yaml"
+    path.write_text("scenes: [{data: demo}]\nparts: [{methods: [3dgs], effects: [rain]}]")
+    main(["bench", str(path), "--output", str(tmp_path / "there"), "--prepare-only"])
+    assert "1 datasets are ready" in capsys.readouterr().out
+    (tmp_path / "here").mkdir()
+    (tmp_path / "there" / "artifacts").rename(tmp_path / "here" / "artifacts")
+    monkeypatch.setitem(sys.modules, "albumentations", None)  # as on a machine without it
+    main(["bench", str(path), "--output", str(tmp_path / "here"), "--prepare-only"])
+    for name in ("images/train_0003.png", "layers/undistorted_B.png", "transforms.json"):
+        there, here = (tmp_path / side / "scenes" / "demo-rain" / name for side in ("there", "here"))
+        assert there.read_bytes() == here.read_bytes()
+
+
+def test_a_dask_cluster_runs_what_it_is_given(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    path = tmp_path / "short.yaml"
+    path.write_text(SHORT)
+    local = {"n_workers": 1, "threads_per_worker": 1, "processes": False, "protocol": "tcp", "dashboard_address": None}
+    with distributed.LocalCluster(**local) as cluster:
+        done = ssa("bench", path, "--output", tmp_path / "out", "--scheduler", cluster.scheduler_address)
+    assert done.returncode == 0, done.stderr
+    (found,), problems = read_all([tmp_path / "out"])
+    assert (found.status, problems) == ("finished", []), found.reason
+    assert len(found.views) == 4
+    assert not list((tmp_path / "out" / "running").iterdir())
+
+
+def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tmp_path):
+    """Runs that fail, for there is no dataset. A process that was killed while it waited is replaced."""
+    place = Workplace(tmp_path)
+    this = psutil.Process()
+    before = set(this.children())
+    ready: dict[int, bool] = {}
+    waited: set[int] = set()
+    results = []
+
+    def watch(processes, waiting):
+        working = {process.popen.pid for process in processes}
+        for process in processes:
+            if process.popen.pid not in ready:
+                ready[process.popen.pid] = process.popen.pid in waited
+                request = Request.load(place.running(process.run.id) / REQUEST)
+                assert request.flip_processes == min(16, max(1, (os.cpu_count() or 1) // 2))
+                assert psutil.Process(process.popen.pid).environ()["CUDA_VISIBLE_DEVICES"] == process.device
+        others = {child for child in this.children() if child not in before and child.pid not in working}
+        waited.update(child.pid for child in others)
+        assert len(others) <= (2 if waiting else 1)
+        if len(results) == 2 and len(waiting) == 1:
+            for child in others:
+                child.kill()
+
+    def ended(run, result):
+        results.append((run.id, result.run.id, result.status))
+
+    runs = plan(benchmark())[:5]
+    local = Local(place, ["4", "7"], 1, lambda run: "the command")
+    assert local.work(runs, lambda run: None, None, watch, ended) == []
+    assert sorted(results) == sorted((run.id, run.id, "failed") for run in runs)
+    assert all(run.dataset in place.log(run.id).read_text() for run in runs)
+    assert list(ready.values()) == [False, False, True, True, False]
+    assert set(this.children()) == before
+    assert list(place.unfinished.iterdir()) == []
+
+
+def test_what_waits_for_a_run_ends_with_the_benchmark(tmp_path):
+    def ended(run, result):
+        raise KeyboardInterrupt
+
+    before = set(psutil.Process().children())
+    local = Local(Workplace(tmp_path), ["0"], 1, lambda run: "the command")
+    with pytest.raises(KeyboardInterrupt):
+        local.work(plan(benchmark())[:2], lambda run: None, None, lambda *_: None, ended)
+    assert set(psutil.Process().children()) == before
+    assert list(Workplace(tmp_path).unfinished.iterdir()) == []
+
+
+def test_imports_are_done_while_the_run_before_is_at_work(tmp_path, monkeypatch):
+    """CUDA_VISIBLE_DEVICES is how `ssa bench` learns of a GPU; that there is none is nothing to it."""
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
+    path = tmp_path / "two.yaml"
+    path.write_text(SHORT.replace("3dgs", "3dgs, overlay-on"))
+    assert ssa("bench", path, "--output", tmp_path / "out").returncode == 0
+    first, second = (each.seconds["startup"] for each in sorted(read_all([tmp_path / "out"])[0], key=lambda r: r.ended))
+    assert second < 0.7 * first
+
+
+def test_a_run_that_fails_says_why(tmp_path, capsys):
+    path = tmp_path / "misspelt.yaml"
+    path.write_text(
+        "scenes: [{data: demo}]\ncandidates: {misspelt: {sparsness: log}}\n"
+        "parts: [{methods: [misspelt], effects: [none], steps: 5}]"
+    )
+    (run,) = plan(read_benchmark(str(path)))
+    main(["bench", str(path), "--output", str(tmp_path / "out")])
+    said = capsys.readouterr().out
+    assert f"1 of 1 runs failed; call the same again to repeat them. First: {run.id}" in said
+    assert "are done" not in said
+    (failed,), _ = read_all([tmp_path / "out"])
+    assert failed.status == "failed"
+    assert failed.command == f"ssa bench {path} --output {tmp_path / 'out'} --only {run.id}"
+    assert "the model has no setting 'sparsness'" in failed.reason
+    assert Expectation([failed]).seconds(run) is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "culprit"),
+    [
+        (["nothing"], "benchmarks has no 'nothing'"),
+        (["smoke", "--scenes", "garden"], "no scene 'garden'"),
+        (["smoke", "--only", "*-snow-*"], "matches no run"),
+        (["smoke", "--time-limit", "0"], "--time-limit"),
+        (["smoke", "--runs-per-device", "0"], "--runs-per-device"),
+        (["smoke", "--merge", "nowhere"], "holds no results"),
+        (["captures", "--prepare-only"], "set SSA_DATA"),
+    ],
+)
+def test_bad_arguments_are_refused_in_one_line(tmp_path, monkeypatch, capsys, arguments, culprit):
+    monkeypatch.setenv("SSA_DATA", str(tmp_path / "empty"))
+    with pytest.raises(SystemExit) as refusal:
+        main(["bench", *arguments, "--output", str(tmp_path / "out")])
+    assert refusal.value.code == 2
+    assert culprit in str(refusal.value)
+    assert capsys.readouterr().err.count("\n") == 1
+    assert not (tmp_path / "out" / "scenes").exists()
+
+
+def test_a_second_benchmark_in_one_folder_is_refused(tmp_path):
+    with (tmp_path / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        with pytest.raises(SystemExit, match="another ssa bench"):
+            main(["bench", "smoke", "--output", str(tmp_path)])
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(SystemExit, match="is a file"):
+        main(["bench", "smoke", "--output", str(tmp_path / "file")])

@@ -1,0 +1,146 @@
+"""Plans: what is run, in which order, under which id, with which settings."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import pytest
+from made_results import benchmark
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Part, SceneEntry, Tradeoff, read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.plan import Run, marks, plan, plan_tradeoff
+from ssa_nerfstudio.experiments.configuration import shipped
+
+
+def test_every_combination_is_there_once_but_those_that_mean_nothing():
+    runs = plan(benchmark())
+    assert len({run.id for run in runs}) == len(runs) == 2 * 2 * 2 * (3 * 6 - 1)
+    assert not [run for run in runs if run.method == "given" and run.effect == "none"]
+
+
+def test_parts_run_in_their_order_and_repeat_nothing():
+    first = Part(methods=("default",), effects=("mud",))
+    second = Part(methods=("3dgs", "default"), effects=("mud", "none"))
+    runs = plan(benchmark(parts=(first, second)))
+    assert [(run.scene, run.effect, run.method) for run in runs] == [
+        ("attic", "mud", "default"),
+        ("barn", "mud", "default"),
+        ("attic", "mud", "3dgs"),
+        ("attic", "none", "3dgs"),
+        ("attic", "none", "default"),
+        ("barn", "mud", "3dgs"),
+        ("barn", "none", "3dgs"),
+        ("barn", "none", "default"),
+    ]
+
+
+def test_the_papers_rule_is_weak_for_mud_and_for_real_artifacts_only():
+    weights = {run.effect: run.model["sparsity_weight"] for run in plan(benchmark()) if run.method == "paper"}
+    assert weights == {"none": 0.05, "dashboard": 0.05, "mud": 0.01}
+    real = plan(benchmark(scenes=(SceneEntry("yard", artifact="finger"),)))
+    assert {run.model["sparsity_weight"] for run in real if run.method == "paper"} == {0.01}
+
+
+def test_a_scene_with_an_artifact_of_its_own_gets_no_other_and_has_no_known_truth():
+    runs = plan(benchmark(scenes=(SceneEntry("yard", artifact="finger"),)))
+    assert {(run.effect, run.real) for run in runs} == {("finger", True)}
+    assert "given" not in {run.method for run in runs}
+
+
+def test_whatever_changes_the_outcome_changes_the_id():
+    run = plan(benchmark())[0]
+    others = [
+        {"seed": 5},
+        {"steps": 701},
+        {"model": {**run.model, "sparsity": "log"}},
+        {"image_scale": 0.5},
+        {"effect_seed": 1},
+        {"downscale": 2},
+        {"nerfstudio_method": "ssa-splatfacto-paper"},
+    ]
+    ids = {dataclasses.replace(run, **change).id for change in others}
+    assert len({*ids, run.id}) == 1 + len(others)
+
+
+def test_a_run_survives_json_with_its_id():
+    run = plan_tradeoff(read_benchmark("smoke"))[-1]
+    assert Run.load(json.loads(json.dumps(dataclasses.asdict(run)))) == run
+    assert Run.load(json.loads(json.dumps(dataclasses.asdict(run)))).id == run.id
+
+
+def test_ids_are_the_same_in_every_process():
+    code = "from ssa_nerfstudio.experiments.benchmark.specification import plan, benchmark_file as s; "
+    code += "print([r.id for r in plan.plan(s.read_benchmark('smoke'))])"
+    printed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert printed.strip() == str([run.id for run in plan(read_benchmark("smoke"))])
+
+
+def test_planning_loads_neither_torch_nor_nerfstudio():
+    code = "import sys; from ssa_nerfstudio.experiments.benchmark.specification import plan, benchmark_file as s; "
+    code += "plan.plan(s.read_benchmark('smoke')); print(sorted({'torch', 'nerfstudio'} & sys.modules.keys()))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
+
+
+@pytest.mark.parametrize("name", sorted(shipped("benchmarks")))
+def test_shipped_benchmarks_can_be_planned(name):
+    stated = read_benchmark(name)
+    assert plan(stated) or stated.tradeoff
+    if stated.tradeoff:
+        assert plan_tradeoff(stated)
+
+
+def test_a_tradeoff_varies_one_knob_at_a_time_and_repeats_no_base():
+    knobs = {"steps": [700, 7000], "overlay_downscale": [1, 2], "densification": ["mcmc"]}
+    tradeoff = Tradeoff(
+        ("barn",), knobs=knobs, base={"overlay_downscale": 1}, together=({"steps": 700, "cap_max": 9},), marks=4
+    )
+    runs = plan_tradeoff(benchmark(tradeoff=tradeoff))
+    variations = [run.variation for run in runs]
+    assert variations == [
+        {},
+        {"steps": 700},
+        {"overlay_downscale": 2},
+        {"densification": "mcmc"},
+        {"steps": 700, "cap_max": 9},
+    ]
+    assert [run.steps for run in runs] == [7000, 700, 7000, 7000, 700]
+    assert runs[2].model["overlay_downscale"] == 2
+    assert runs[3].model["strategy"] == runs[3].densification == "mcmc"
+    assert {run.model["overlay"] for run in runs} == {"on"}
+    assert all(len(run.marks) == 4 and run.marks[-1] == run.steps for run in runs)
+
+
+@pytest.mark.parametrize(("steps", "count"), [(1, 1), (1, 8), (10, 8), (7000, 8), (30000, 12)])
+def test_marks_rise_to_the_last_step(steps, count):
+    stops = marks(steps, count)
+    assert list(stops) == sorted(set(stops))
+    assert stops[0] >= 1
+    assert stops[-1] == steps
+    assert len(stops) <= count
+
+
+@pytest.mark.parametrize(
+    ("text", "culprit"),
+    [
+        ("scenes: []", "at least one"),
+        ("scenes: [{data: a}, {data: b/a}]", "names of their own"),
+        ("scenes: [{data: a}]\nparts: [{methods: [ours]}]", "no method 'ours'"),
+        ("scenes: [{data: a}]\nparts: [{methods: [3dgs], scenes: [b]}]", "no scene 'b'"),
+        ("scenes: [{data: a}]\nparts: [{methods: [3dgs], steps: 0}]", "steps must be at least 1"),
+        ("scenes: [{data: a}]\nparts: [{methods: [3dgs], densification: [both]}]", "adc, mcmc"),
+        ("scenes: [{data: a, downscale: 0}]", "downscale"),
+        ("scenes: [{data: 'a b'}]", "letters, digits"),
+        ("scenes: [{data: a}]\ncandidates: {paper: {sparsity: log}}", "candidate 'paper'"),
+        ("scenes: [{data: a}]\ntradeoff: {scenes: [a], knobs: {steps: 5}}", "knobs.steps must be a list"),
+    ],
+)
+def test_a_faulty_file_is_refused_in_one_line(tmp_path, capsys, text, culprit):
+    path = tmp_path / "faulty.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=culprit) as refusal:
+        read_benchmark(str(path))
+    assert capsys.readouterr().err.count("\n") == 1

@@ -1,0 +1,223 @@
+"""Reports from made-up results, whose every number can be worked out by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+
+import pytest
+from made_results import all_results, benchmark, folder_of, result
+from PIL import Image
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.report import paper_tables as paper
+from ssa_nerfstudio.experiments.benchmark.report import tables
+from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import report, store_plan
+from ssa_nerfstudio.experiments.benchmark.report.study import studies
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Part, SceneEntry
+from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
+
+
+def table(drawn) -> dict[tuple[str, ...], list[str]]:
+    """Rows by their first cells, with bold marks removed."""
+    rows = [[cell.replace("**", "") for cell in row] for row in drawn.rows]
+    return {tuple(row[:3]): row for row in rows} | {(row[0],): row for row in rows}
+
+
+def column(drawn, row: str, heading: str) -> str:
+    return table(drawn)[(row,)][drawn.headings.index(heading)]
+
+
+def test_a_category_is_the_mean_over_scenes_and_seeds_of_adc_and_mcmc():
+    (study,) = studies(all_results())
+    drawn = tables.results_by_category(study, with_paper=False)
+    assert column(drawn, "Dashboard", "3DGS PSNR ↑") == "16.05 / 17.05"
+    assert column(drawn, "Mean", "SSA, paper's rule PSNR ↑") == "20.05 / 21.05"
+    assert column(drawn, "Clean (Ref)", "true overlay given PSNR ↑") == "-"
+    assert [row[0] for row in drawn.rows] == ["Clean (Ref)", "Dashboard", "Mud", "Mean"]
+    bold = [cell for row in drawn.rows for cell in row if re.fullmatch(r"20.55 / \*\*21.55\*\*", cell)]
+    assert len(bold) == 4  # the default is the best of every row
+
+
+def test_a_diverged_run_is_left_out_of_means_marked_and_counted(tmp_path):
+    results = all_results()
+    bad = next(
+        k for k, r in enumerate(results) if (r.run.scene, r.run.effect, r.run.method) == ("attic", "mud", "3dgs")
+    )
+    results[bad] = dataclasses.replace(results[bad], status="diverged", reason="means of a Gaussian is not finite")
+    results[bad] = dataclasses.replace(results[bad], metrics={}, views={}, seconds={})
+    (study,) = studies(results)
+    value = study.value("mud", "3dgs", "adc", "psnr")
+    assert value is not None
+    assert value.diverged == 1
+    assert value.mean == pytest.approx((16.1 + 16.05) / 2)  # attic has only its second seed left
+    assert column(tables.results_by_category(study, False), "Mud", "3DGS PSNR ↑").split(" / ")[0].endswith("†")
+    folder_of(tmp_path, results)
+    report([tmp_path], tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "1 diverged" in text
+    assert "means of a Gaussian is not finite" in text
+
+
+def test_a_mean_over_too_few_scenes_says_so():
+    results = [r for r in all_results() if not (r.run.scene == "barn" and r.run.method == "given")]
+    (study,) = studies(results)
+    cell = column(tables.results_by_category(study, False), "Mud", "true overlay given PSNR ↑")
+    assert cell == "20.35 (1/2) / 21.35 (1/2)"
+
+
+def test_the_spread_over_seeds_is_their_standard_deviation():
+    (study,) = studies(all_results())
+    drawn = tables.results_by_scene(study)
+    row = next(row for row in drawn.rows if row[:2] == ["mud", "barn"])
+    assert "16.05 ± 0.07 / 17.05 ± 0.07" in row
+
+
+def test_differences_are_paired_by_view_and_seed():
+    (study,) = studies(all_results())
+    drawn = tables.paired(study, "default")
+    assert drawn is not None
+    rows = {tuple(row[:3]): row[3] for row in drawn.rows}
+    assert rows["minus 3DGS", "ADC", "Mud"] == "+4.50 [+4.50, +4.50]"
+    assert rows["minus true overlay given", "MCMC", "Mean"] == "+0.20 [+0.20, +0.20]"
+    assert rows["minus SSA, paper's rule", "ADC", "Clean photos"] == "+0.50 [+0.50, +0.50]"
+
+
+def test_the_bar_tells_where_it_is_not_reached():
+    results = all_results()
+    for k, r in enumerate(results):
+        if (r.run.scene, r.run.effect, r.run.method, r.run.densification) == ("barn", "mud", "default", "adc"):
+            results[k] = dataclasses.replace(r, metrics={**r.metrics, "psnr": 20.0})
+    (study,) = studies(results)
+    drawn = tables.bar(study)
+    assert drawn is not None
+    verdicts = {(row[0], row[1].split(":")[0]): (row[2], row[3]) for row in drawn.rows}
+    assert verdicts["ADC", "barn, mud"] == ("-0.35", "**no**")
+    assert verdicts["ADC", "attic, mud"] == ("+0.20", "yes")
+    assert verdicts["MCMC", "mean over all"] == ("+0.20", "yes")
+
+
+def test_ablation_and_sensitivity_are_the_papers_tables():
+    (study,) = studies(all_results())
+    drawn = tables.ablation(study, with_paper=False)
+    assert drawn is not None
+    assert column(drawn, "L_sparse + const. init", "PSNR ↑") == "19.05 / 20.05"
+    assert column(drawn, "No regularization", "colour deviation ↓") == "5.00 / 5.00"
+    weights = tables.sensitivity(study, with_paper=False)
+    assert weights is not None
+    assert weights.rows[-1][:2] == ["Mean, the paper's rule", "20.05 / 21.05"]
+
+
+def test_other_lengths_and_other_artifacts_are_tables_of_their_own():
+    parts = (
+        Part(methods=("3dgs",), effects=("none", "mud"), steps=700),
+        Part(methods=("3dgs",), effects=("mud",), steps=700, effect_seed=1),
+        Part(methods=("3dgs",), effects=("mud",), steps=3000),
+    )
+    found = studies(all_results(parts=parts))
+    assert [(s.steps, s.effect_seed, len(s.results)) for s in found] == [(700, 0, 4), (700, 1, 4), (3000, 0, 2)]
+
+
+def _paper_report(tmp_path, steps: int) -> str:
+    part = Part(methods=("3dgs", "paper"), effects=("none", "mud"), densification=("adc", "mcmc"), steps=steps)
+    made = benchmark(parts=(part,), protocol="paper")
+    runs = plan(made)
+    folder_of(tmp_path, [result(run) for run in runs])
+    store_plan(tmp_path, "bench", made, runs)
+    report([tmp_path], tmp_path / "report")
+    return (tmp_path / "report" / "report.md").read_text()
+
+
+def test_the_papers_figures_stand_beside_ours_where_the_protocol_is_the_same(tmp_path):
+    assert "23.21 / 22.84 | 0.708 / 0.742" in _paper_report(tmp_path / "same", 30_000)
+    assert "23.21" not in _paper_report(tmp_path / "shorter", 7000)
+
+
+def test_the_papers_means_are_those_of_its_rows():
+    for method in ("3dgs", "paper"):
+        for densification in ("adc", "mcmc"):
+            rows = [
+                paper.RESULTS[kind, method, densification] for kind in ("watermark", "ui", "dashboard", "rain", "mud")
+            ]
+            for number, tolerance in ((0, 0.002), (1, 0.001), (2, 0.001)):
+                mean = sum(row[number] for row in rows) / 5
+                assert mean == pytest.approx(paper.RESULTS["mean", method, densification][number], abs=tolerance)
+
+
+def test_real_captures_are_compared_with_the_papers_real_table(tmp_path):
+    part = Part(methods=("3dgs", "paper"), steps=30_000)
+    made = benchmark(scenes=(SceneEntry("yard", artifact="finger"),), parts=(part,), protocol="paper")
+    folder_of(tmp_path, [result(run) for run in plan(made)])
+    store_plan(tmp_path, "bench", made, plan(made))
+    report([tmp_path], tmp_path / "report")
+    assert "| 13.45 | 0.575 | 0.506 | 16.67 |" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_what_is_missing_truncated_or_foreign_is_named_and_the_report_goes_on(tmp_path):
+    results = all_results()
+    folder_of(tmp_path, results[1:])
+    store_plan(tmp_path, "bench", benchmark(), plan(benchmark()))
+    whole = sorted((tmp_path / "results").glob("*.json"))
+    whole[0].write_text(whole[0].read_text()[:100])
+    (tmp_path / "results" / "foreign.json").write_text(json.dumps({"psnr": 1}))
+    _, problems = report([tmp_path], tmp_path / "report")
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert [whole[0].name in problems[0], "foreign.json" in problems[1]] == [True, True] or "foreign.json" in problems[
+        0
+    ]
+    assert all(line in text for line in problems)
+    assert f"2 of {len(results)} planned ones are missing: " in text
+    assert f"`{results[0].run.id}`" in text
+
+
+def test_several_folders_are_added_up_without_copying(tmp_path):
+    results = all_results()
+    folder_of(tmp_path / "a", results[::2])
+    folder_of(tmp_path / "b", results[1::2])
+    report([tmp_path / "a", tmp_path / "b"], tmp_path / "report")
+    report([folder_of(tmp_path / "c", results)], tmp_path / "whole")
+    added, whole = ((tmp_path / name / "report.md").read_text().split("Made on")[1] for name in ("report", "whole"))
+    assert added == whole
+
+
+def test_runs_of_several_revisions_are_pointed_out(tmp_path):
+    results = all_results()
+    folder_of(tmp_path, [*results[1:], dataclasses.replace(results[0], revision="def+")])
+    report([tmp_path], tmp_path / "report")
+    assert "several revisions" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_a_training_under_two_names_is_pointed_out(tmp_path):
+    results = all_results()
+    folder_of(tmp_path, [*results[1:], dataclasses.replace(results[0], same_as=results[1].run.id)])
+    report([tmp_path], tmp_path / "report")
+    assert "1 of them are the trainings of others" in (tmp_path / "report" / "report.md").read_text()
+
+
+def test_the_page_escapes_what_it_shows_and_holds_its_pictures(tmp_path):
+    results = all_results()[:1]
+    results.append(dataclasses.replace(all_results()[1], status="failed", reason="<script>alert(1)</script>"))
+    folder_of(tmp_path, results)
+    pictures = tmp_path / "pictures" / results[0].run.id
+    pictures.mkdir(parents=True)
+    for name in ("photo", "test", "render"):
+        Image.new("RGB", (48, 36), "red").save(pictures / f"{name}.jpg")
+    report([tmp_path], tmp_path / "report")
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert "<script>" not in page
+    assert "&lt;script&gt;" in page
+    assert page.count("data:image/jpeg;base64,") == 1
+    assert "http" not in page
+
+
+@pytest.mark.parametrize("content", ["nothing", "no results", "only a failure"])
+def test_a_folder_without_results_is_refused(tmp_path, capsys, content):
+    if content != "nothing":
+        (tmp_path / "results").mkdir()
+    if content == "only a failure":
+        folder_of(tmp_path, [dataclasses.replace(all_results()[0], status="failed")])
+    with pytest.raises(InputError):
+        report([tmp_path], tmp_path / "report")
+    assert not (tmp_path / "report").exists()
+    assert capsys.readouterr().err.count("\n") == 1

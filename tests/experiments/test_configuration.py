@@ -1,0 +1,184 @@
+"""YAML in, dataclass out; shipped configurations; every message names the file and the key."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.configuration import build, locate, read, shipped
+from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS, effect_class
+from ssa_nerfstudio.experiments.simulation.scene import read_effects, read_scene
+
+REPOSITORY = Path(__file__).parents[2]
+
+
+@dataclass(frozen=True)
+class Inner:
+    depth: int = 1
+
+
+@dataclass(frozen=True)
+class Outer:
+    rate: float
+    name: str = "x"
+    on: bool = False
+    kind: Literal["a", "b"] = "a"
+    pair: tuple[int, int] = (0, 0)
+    many: list[float] = field(default_factory=list)
+    maybe: int | None = None
+    folder: Path = Path()
+    inner: Inner = field(default_factory=Inner)
+    free: Any = None
+
+    def __post_init__(self) -> None:
+        if self.rate < 0:
+            raise ValueError(f"Outer.rate must not be negative, got {self.rate}")
+
+
+def test_values_become_what_the_fields_say():
+    stated = {"rate": 2, "pair": [1, 2], "many": [1, 2.5], "folder": "a/b", "inner": {"depth": 3}, "free": {"k": []}}
+    built = build(Outer, stated, "here")
+    assert built == Outer(2.0, pair=(1, 2), many=[1.0, 2.5], folder=Path("a/b"), inner=Inner(3), free={"k": []})
+    assert isinstance(built.rate, float)
+    assert build(Outer, {"rate": "1e-3"}, "here").rate == 0.001  # YAML 1.1 takes that for a text
+    assert build(Outer, {"rate": 0, "maybe": 4}, "here").maybe == 4
+    assert build(Outer, {"rate": 0, "maybe": None}, "here").maybe is None
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([], "Outer must be keys and values, got []"),
+        ({}, "Outer needs the key 'rate'"),
+        ({"rate": 1, "nme": "y"}, "unknown key 'nme' (did you mean 'name'?); Outer has rate, name, on"),
+        ({"rate": -1}, "Outer.rate must not be negative, got -1.0"),
+        ({"rate": "fast"}, "Outer.rate must be a number, got 'fast'"),
+        ({"rate": True}, "Outer.rate must be a number, got True"),
+        ({"rate": None}, "Outer.rate must be a number, got None"),
+        ({"rate": 1, "name": 3}, "Outer.name must be a text, got 3"),
+        ({"rate": 1, "on": 1}, "Outer.on must be true or false, got 1"),
+        ({"rate": 1, "kind": "c"}, "Outer.kind must be one of a, b, got 'c'"),
+        ({"rate": 1, "pair": [1]}, "Outer.pair must be a list of 2 values, got [1]"),
+        ({"rate": 1, "pair": [1, 2.5]}, "Outer.pair must be a whole number, got 2.5"),
+        ({"rate": 1, "many": 3}, "Outer.many must be a list, got 3"),
+        ({"rate": 1, "maybe": "no"}, "Outer.maybe must be a whole number or nothing, got 'no'"),
+        ({"rate": 1, "folder": 3}, "Outer.folder must be a path, got 3"),
+        ({"rate": 1, "inner": {"dept": 3}}, "unknown key 'dept' (did you mean 'depth'?)"),
+        ({"rate": 1, "inner": 3}, "Inner must be keys and values, got 3"),
+    ],
+)
+def test_wrong_values_are_named_in_one_line(values, message, capsys):
+    with pytest.raises(InputError) as caught:
+        build(Outer, values, "file.yaml")
+    assert f"file.yaml: {message}" in str(caught.value)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("- 1", "holds no keys and values"),
+        ("", "holds no keys and values"),
+        ("a: [", "is no valid YAML"),
+        ("a: 1\nb: 2\na: 3", "key 'a' twice"),
+        ("a: !!python/object:os.system x", "is no valid YAML"),
+        (b"a: \xff", "cannot be read"),
+    ],
+)
+def test_files_that_are_no_configuration_are_refused(text, message, tmp_path, capsys):
+    path = tmp_path / "x.yaml"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(InputError) as caught:
+        read(path)
+    assert message in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_every_effect_is_shipped_with_its_defaults():
+    for name in EFFECTS:
+        assert read_effects((name,)) == ((name, effect_class(name)()),)
+
+
+@pytest.mark.parametrize("name", shipped("effects"))
+def test_shipped_effects_can_be_read(name):
+    ((effect, _),) = read_effects((name,))
+    assert name.startswith(effect)
+
+
+@pytest.mark.parametrize("name", shipped("scenes"))
+def test_shipped_scenes_can_be_read(name):
+    assert read_scene(name).effects
+
+
+def test_names_and_files_are_found(tmp_path):
+    own = tmp_path / "own.yaml"
+    own.write_text("effect: dust")
+    assert locate("effects", str(own)) == own
+    assert locate("effects", "mud-thick").name == "mud-thick.yaml"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed: 1", "SceneFile needs the key 'effects'"),
+        ("effects: rain", "SceneFile.effects must be a list, got 'rain'"),
+        ("effects: []\nseed: -1", "SceneFile.seed must not be negative, got -1"),
+        ("effects: []\nseed: a", "SceneFile.seed must be a whole number, got 'a'"),
+        ("effects: []\nsed: 1", "unknown key 'sed' (did you mean 'seed'?)"),
+        ("effects: [rian]", "effects has no 'rian' (did you mean 'rain'?)"),
+        ("effects: [3]", "effects[0]: key 'effect' is missing"),
+        ("effects: [{alpha: 1}]", "effects[0]: key 'effect' is missing"),
+        ("effects: [dust, {effect: fog}]", "effects[1]: effect 'fog' is unknown; choose one of watermark"),
+        ("effects: [{effect: [dust]}]", "effects[0]: effect ['dust'] is unknown"),
+        ("effects: [{effect: rain, intensty: 1}]", "effects[0]: unknown key 'intensty' (did you mean 'intensity'?)"),
+        ("effects: [{effect: rain, intensity: 2}]", "effects[0]: Rain.intensity must be in (0, 1], got 2.0"),
+        ("effects: [{effect: rain, intensity: .nan}]", "effects[0]: Rain.intensity must be in (0, 1], got nan"),
+        ("effects: [{effect: rain, intensity: lots}]", "effects[0]: Rain.intensity must be a number, got 'lots'"),
+        ("effects: [{effect: mud, colour: [1, 2]}]", "effects[0]: Mud.colour must be a list of 3 values, got [1, 2]"),
+        ("effects: [{effect: mud, colour: [1, 2, 256]}]", "effects[0]: Mud.colour must be three numbers in 0..255"),
+        (
+            "effects: [{effect: finger, side: middle}]",
+            "effects[0]: Finger.side must be one of left, right, top, bottom",
+        ),
+    ],
+)
+def test_bad_scenes_are_named_in_one_line(text, message, tmp_path, capsys):
+    path = tmp_path / "scene.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        read_scene(str(path))
+    assert message in str(caught.value)
+    assert capsys.readouterr().err.count("\n") == 1
+    if "has no" not in message:
+        assert str(path) in str(caught.value)
+
+
+def test_a_bad_effect_file_is_named(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("effect: vignette\nstrength: 2")
+    with pytest.raises(InputError, match=r"mine\.yaml: Vignette\.strength must be in \(0, 1\], got 2\.0"):
+        read_effects((str(path),))
+
+
+def test_configurations_are_installed_with_the_package(tmp_path):
+    built = tmp_path / "built"
+    command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path), "build_py"]
+    subprocess.run([*command, "--build-lib", str(built)], cwd=REPOSITORY, check=True, capture_output=True)
+    code = "from ssa_nerfstudio.experiments.configuration import shipped as s; print(*s('effects').values(), *s('scenes').values())"
+    environment = {**os.environ, "PYTHONPATH": str(built)}
+    found = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
+    ).stdout.split()
+    folder = built / "ssa_nerfstudio/configs"
+    expected = sorted(path.relative_to(REPOSITORY / "configs") for path in (REPOSITORY / "configs").glob("*/*.yaml"))
+    assert sorted(Path(path).relative_to(folder) for path in found) == [
+        path for path in expected if path.parent.name in ("effects", "scenes")
+    ]
