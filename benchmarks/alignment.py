@@ -1,12 +1,12 @@
-"""How far camera centres are from where they should be, when only their shape is known."""
+"""How far camera centers are from where they should be, when only their shape is known."""
 
 from __future__ import annotations
 
 import numpy as np
 
 
-def centre_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
-    """Distances of camera centres after the similarity that fits them best in the least-squares sense.
+def center_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Distances of camera centers after the similarity that fits them best in the least-squares sense.
 
     Args:
         found: [N, 3], in any frame and scale; N at least 3, not all on one line.

@@ -22,7 +22,7 @@ from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 @dataclass
 class Command:
-    """Errors of matte, colour and picture, for each artifact of the demo."""
+    """Errors of matte, color and picture, for each artifact of the demo."""
 
     steps: int = 600
     """Training steps."""
@@ -49,9 +49,9 @@ class Command:
             laid = 255 * alpha * learned[..., :3] + (1 - alpha) * clean
             picture = np.abs(laid - truth.apply(clean.astype(np.uint8)))
             print(
-                f"{name}: matte {matte.mean():.4f} mean, {np.percentile(matte, 99):.3f} 99th percentile; colour where "
-                f"it covers {color.mean():.1f}, {np.percentile(color, 99):.1f} grey levels; laid over a clean photo "
-                f"{picture.mean():.2f}, {np.percentile(picture, 99):.1f} grey levels"
+                f"{name}: matte {matte.mean():.4f} mean, {np.percentile(matte, 99):.3f} 99th percentile; color where "
+                f"it covers {color.mean():.1f}, {np.percentile(color, 99):.1f} gray levels; laid over a clean photo "
+                f"{picture.mean():.2f}, {np.percentile(picture, 99):.1f} gray levels"
             )
 
 

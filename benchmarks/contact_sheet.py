@@ -26,7 +26,7 @@ def contact_sheet(scene: DemoScene, seed: int = 0) -> Image.Image:
         seed: of the effects.
 
     Returns:
-        A picture of 256 colours, four tiles of half the frame's size a row.
+        A picture of 256 colors, four tiles of half the frame's size a row.
     """
     photos = [scene.render(pose) for pose in scene.cameras[0][:2]]
     tiles = [("clean", photos[0])]

@@ -2,7 +2,7 @@
 
 `python benchmarks/detection.py --data DIR DIR ...` puts each effect in front of the raw photos of each
 capture, with several seeds and numbers of views, and prints one row a capture and effect. With `--contiguous` the views
-are neighbours, as in a short clip, where a scene has had least time to move.
+are neighbors, as in a short clip, where a scene has had least time to move.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def spread(total: int, count: int) -> set[int]:
 
 
 def stretches(total: int, count: int) -> list[set[int]]:
-    """Numbers of neighbouring views at the beginning, in the middle and at the end of a capture."""
+    """Numbers of neighboring views at the beginning, in the middle and at the end of a capture."""
     return [set(range(start, start + count)) for start in (0, (total - count) // 2, total - count)]
 
 
@@ -105,7 +105,7 @@ class Command:
     views: tuple[int, ...] = (12, 25, 50)
     """Numbers of views; 0 for all, unless contiguous."""
     contiguous: bool = False
-    """Views that are neighbours: the first, the middle and the last so many. Otherwise spread evenly."""
+    """Views that are neighbors: the first, the middle and the last so many. Otherwise spread evenly."""
     seeds: int = 5
     """Draws of each effect and of detection's shifts."""
     rate: bool = False

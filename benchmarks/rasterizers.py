@@ -36,7 +36,7 @@ def random_scene(
         size: their median standard deviation, in world units.
 
     Returns:
-        The scene, with colours as third-degree spherical harmonics.
+        The scene, with colors as third-degree spherical harmonics.
     """
     generator = torch.Generator().manual_seed(seed)
 

@@ -1,8 +1,8 @@
 """How well does structure from motion survive a static artifact, and what helps?
 
 `python benchmarks/sfm.py --data DIR ...` puts artifacts in front of the photos of datasets with known
-poses, runs `ssa process` on them in several ways, and prints one row a run. Camera centres are compared with
-transforms.json after a similarity alignment, relative to the mean distance of the true centres from their middle.
+poses, runs `ssa process` on them in several ways, and prints one row a run. Camera centers are compared with
+transforms.json after a similarity alignment, relative to the mean distance of the true centers from their middle.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.alignment import centre_errors
+from benchmarks.alignment import center_errors
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.data.transforms import Dataset
 from ssa_nerfstudio.errors import InputError
@@ -44,11 +44,11 @@ def measure(
         mask: bool [height, width], True where features may lie, or None.
         detect: whether the command finds a mask by itself.
         settings: of structure from motion.
-        true: camera centre [3] by the stem of the photo's file.
+        true: camera center [3] by the stem of the photo's file.
 
     Returns:
-        photos, registered, points; and error, the root mean square of the camera centres' errors in percent of the mean
-        distance of the true centres from their middle (not a number below 4 registered photos).
+        photos, registered, points; and error, the root mean square of the camera centers' errors in percent of the mean
+        distance of the true centers from their middle (not a number below 4 registered photos).
     """
     source = read_source(photos, "frame", least=3)
     found = {"photos": len(source.photos), "registered": 0, "points": 0, "error": float("nan")}
@@ -59,13 +59,13 @@ def measure(
         except InputError:
             return found
         frames = json.loads((output / "transforms.json").read_text())["frames"]
-    centres = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    centers = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
     wanted = np.array([true[Path(frame["source_name"]).stem] for frame in frames])
     found |= {"registered": len(frames), "points": outcome.points}
     if len(frames) > 3:
         everywhere = np.array([true[photo.stem] for photo in source.photos])
         extent = np.linalg.norm(everywhere - everywhere.mean(axis=0), axis=1).mean()
-        found["error"] = 100 * float(np.sqrt(np.square(centre_errors(centres, wanted)).mean()) / extent)
+        found["error"] = 100 * float(np.sqrt(np.square(center_errors(centers, wanted)).mean()) / extent)
     return found
 
 

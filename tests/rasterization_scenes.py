@@ -30,7 +30,7 @@ def scene(
 ) -> Scene:
     """`random_scene`, its cube around (0, 0, 3), seen by cameras around it; numbers that float32 holds exactly.
 
-    No more colour coefficients than `sh_degree` needs; camera 0 is the identity.
+    No more color coefficients than `sh_degree` needs; camera 0 is the identity.
     """
     gaussians, viewmats, Ks = random_scene(n, width, height, size, dtype, seed)
     in_camera = gaussians["means"] @ viewmats[0, :3, :3].T + viewmats[0, :3, 3]

@@ -53,7 +53,7 @@ class Lens:
 
     @property
     def matrix(self) -> np.ndarray:
-        """K [3, 3] float32 in OpenCV's convention, where (0, 0) is the centre of the corner pixel."""
+        """K [3, 3] float32 in OpenCV's convention, where (0, 0) is the center of the corner pixel."""
         matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float32)
         # In float32 as nerfstudio does it, so that the crop comes out the same to the pixel.
         matrix[:2, 2] = matrix[:2, 2] - 0.5
@@ -79,7 +79,7 @@ def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
     """A picture of the raw frame, in the undistorted frame.
 
     Bilinear, as nerfstudio warps photos. T and B = A W of an artifact are warped each for itself (premultiplied);
-    their straight colour must not be. Where the lens has no distortion the picture is returned as it is.
+    their straight color must not be. Where the lens has no distortion the picture is returned as it is.
 
     Args:
         image: uint8 or float32 [H, W, C] or [H, W] of the lens' size.

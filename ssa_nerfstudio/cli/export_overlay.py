@@ -79,7 +79,7 @@ class Command:
             console.print(
                 f"{self.output / 'photos'}: {len(recovered)} photos; {hidden:.1%} of their pixels lie behind a matte "
                 f"above 0.95 and could not be recovered (black). Where the artifact is estimated wrongly, pixels leave "
-                f"the range of colours: at most {implausible.implausible:.1%} of a photo ({implausible.path})."
+                f"the range of colors: at most {implausible.implausible:.1%} of a photo ({implausible.path})."
             )
             if clipped := sum(r.clipped for r in recovered) / len(recovered):
                 console.print(

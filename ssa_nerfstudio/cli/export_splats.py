@@ -20,11 +20,11 @@ class Command:
     output_filename: str = "splat.ply"
     """Name of the PLY file; an older one is replaced."""
     ply_color_mode: Literal["sh_coeffs", "rgb"] = "sh_coeffs"
-    """Colours as spherical harmonics, or as 8-bit red, green and blue."""
+    """Colors as spherical harmonics, or as 8-bit red, green and blue."""
     compressed: bool = False
     """Also write PlayCanvas' compressed PLY (about a quarter of the size, lossy) as NAME.compressed.ply."""
     obb_center: tuple[float, float, float] | None = None
-    """Centre of a box outside of which nothing is exported; needs all three."""
+    """Center of a box outside of which nothing is exported; needs all three."""
     obb_rotation: tuple[float, float, float] | None = None
     """The box's roll, pitch and yaw, radians."""
     obb_scale: tuple[float, float, float] | None = None

@@ -32,11 +32,11 @@ class Command:
     """Detect where an opaque artifact is (see ssa detect) and mask it, where --mask is not given. What light
     shines through is never masked: the scene behind it would be lost, too."""
     frames: int = 200
-    """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighbourhood."""
+    """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighborhood."""
     min_registered: float = 0.5
     """Stop when less than this share of a pass's photos could be registered."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """All pairs of photos, or neighbours in time and a net over all; auto: all pairs up to 150 photos."""
+    """All pairs of photos, or neighbors in time and a net over all; auto: all pairs up to 150 photos."""
     flatten: bool = True
     """Look for features in copies of the photos of --train that lack what is the same in all of them, where they
     share anything; the dataset's photos stay as they are."""

@@ -36,11 +36,12 @@ class Command(BenchCommand):
         if self.prepare_only or self.list:
             return
         from ssa_nerfstudio.experiments.benchmark.execution.execute import select
-        from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyse
 
         chosen = {run.id for run in select(planned, self.scenes, self.only)}
         console = Console(highlight=False, soft_wrap=True)
-        files, problems = analyse([self.output, *self.merge], self.output / "tradeoff", chosen)
+        from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyze
+
+        files, problems = analyze([self.output, *self.merge], self.output / "tradeoff", chosen)
         for problem in problems:
             console.print(f"left out: {problem}", style="yellow")
         for file in files:

@@ -17,7 +17,7 @@ def read_photo(path: Path, width: int, height: int) -> np.ndarray:
     """Decodes a photo, ignoring EXIF orientation as nerfstudio does.
 
     Args:
-        path: an image file of 8-bit RGB or grey, or RGBA without transparent pixels.
+        path: an image file of 8-bit RGB or gray, or RGBA without transparent pixels.
         width, height: what transforms.json says it is, pixels.
 
     Returns:

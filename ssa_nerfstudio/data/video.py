@@ -1,4 +1,4 @@
-"""Frames of a video: evenly spaced, the sharpest of their neighbourhood."""
+"""Frames of a video: evenly spaced, the sharpest of their neighborhood."""
 
 from __future__ import annotations
 
@@ -81,12 +81,12 @@ class Video:
 
 
 def _sharpness(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of the grey frame at a width of 480 pixels: motion blur lowers it, noise hardly counts.
+    """Variance of the Laplacian of the gray frame at a width of 480 pixels: motion blur lowers it, noise hardly counts.
 
     Pertuz et al. 2013, Analysis of focus measure operators for shape-from-focus.
     """
-    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
-    if grey.shape[1] > _SHARPNESS_WIDTH:
-        height = round(grey.shape[0] * _SHARPNESS_WIDTH / grey.shape[1])
-        grey = cv2.resize(grey, (_SHARPNESS_WIDTH, max(height, 1)), interpolation=cv2.INTER_AREA)
-    return float(cv2.Laplacian(grey, cv2.CV_64F).var())
+    gray = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    if gray.shape[1] > _SHARPNESS_WIDTH:
+        height = round(gray.shape[0] * _SHARPNESS_WIDTH / gray.shape[1])
+        gray = cv2.resize(gray, (_SHARPNESS_WIDTH, max(height, 1)), interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(gray, cv2.CV_64F).var())

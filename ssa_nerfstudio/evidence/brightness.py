@@ -1,4 +1,4 @@
-"""Brightness of runs of neighbouring views at a working resolution: what detection looks at, whatever their number."""
+"""Brightness of runs of neighboring views at a working resolution: what detection looks at, whatever their number."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from torch import Tensor
 WORKING_SIZE = 480
 """Photos are reduced by a whole number until their longer side is nearest to this, pixels."""
 MOST_BLOCKS = 16
-"""When so many blocks are full, neighbours are joined and blocks grow to twice as many views."""
+"""When so many blocks are full, neighbors are joined and blocks grow to twice as many views."""
 
 
 class BrightnessBlocks:
-    """Mean brightness of blocks of neighbouring views, reduced by box filtering.
+    """Mean brightness of blocks of neighboring views, reduced by box filtering.
 
-    Neighbouring views of a video look alike; views of different blocks much less. Gradients are linear, so that of a
+    Neighboring views of a video look alike; views of different blocks much less. Gradients are linear, so that of a
     block's mean is the mean of its views' gradients, at any scale. Memory: two images of the working resolution a
     block, for any number of views.
     """

@@ -151,7 +151,7 @@ def _read_upright(photo: Path) -> np.ndarray:
 
 
 def _evidence_picture(detection: Detection) -> np.ndarray:
-    """Evidence in colours, brightest at twice what is needed; uint8 [h, w, 3]."""
+    """Evidence in colors, brightest at twice what is needed; uint8 [h, w, 3]."""
     level = (detection.evidence.cpu().numpy() / (2 * EVIDENCE_NEEDED[0])).clip(0, 1)
     colored = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)
     return cv2.cvtColor(colored, cv2.COLOR_BGR2RGB)

@@ -50,7 +50,7 @@ SIGNIFICANCE = 0.01
 LEAST_VIEWS = 6
 """With fewer views than this, standard errors mean nothing and nothing is reported."""
 CLIPPED = 1.5 / 255
-"""Colours this near to black or white in all channels say nothing: whatever exceeds the range looks constant."""
+"""Colors this near to black or white in all channels say nothing: whatever exceeds the range looks constant."""
 OPAQUE_SHARE = 0.25
 """Share of the artifact's area that has to be opaque for that verdict."""
 _AROUND = np.ones((3, 3), np.uint8)
@@ -123,7 +123,7 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
 def static_area(statistics: ImageStatistics) -> StaticArea:
     """The area of static edges, and everything where there are too few views.
 
-    Where there are too few edges to report, what no view changes by half a grey level: no scene is so constant, unless
+    Where there are too few edges to report, what no view changes by half a gray level: no scene is so constant, unless
     it is clipped to black or white.
     """
     if int(statistics.views.max()) < LEAST_VIEWS:

@@ -1,4 +1,4 @@
-"""What an artifact looks like, from its edges alone: a matte and a difference in colour before anything is trained.
+"""What an artifact looks like, from its edges alone: a matte and a difference in color before anything is trained.
 
 A photo shows I = T C + B, so that the deviation of the views is T times that of the scene behind, and their mean
 differs from the scene's by B - (1 - T) C. At static edges the gradients of both belong to the artifact, elsewhere to
@@ -23,7 +23,7 @@ BACKGROUND_SCALE = 2.0
 LEAST_MATTE = 0.1
 """An estimated matte from which on an artifact is at work. Constant start's matte, too (`layer.CONSTANT_START`)."""
 LEAST_DIFFERENCE = 10 / 255
-"""Difference in colour from which on an artifact is at work."""
+"""Difference in color from which on an artifact is at work."""
 REACH = 32
 """Working pixels from the nearest static edge beyond which the estimate is nothing: where edges have gaps, it leaks."""
 OPAQUE_STEP = 1.6

@@ -83,9 +83,9 @@ def _reduced(layers: Tensor, overlay: ScreenSpaceOverlay) -> Tensor:
 
 
 def _mean_color(color: Tensor, matte: Tensor) -> Tensor:
-    """The mean color [3] of an artifact, of colours [H, W, 3] weighed by a matte [H, W, 1].
+    """The mean color [3] of an artifact, of colors [H, W, 3] weighed by a matte [H, W, 1].
 
-    Where an artifact was missed, its colour is most likely this one, and a film of it is learned no sooner than it is
+    Where an artifact was missed, its color is most likely this one, and a film of it is learned no sooner than it is
     there. From the mean of the photos, the matte grows wherever a render is wrong: less contrast is a smaller error.
     """
     return (color.clamp(0, 1) * matte).sum(dim=(0, 1)) / matte.sum()

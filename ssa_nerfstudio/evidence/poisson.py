@@ -7,7 +7,7 @@ import scipy.fft
 
 
 def divergence(across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Of differences between neighbours: [h, w - 1] from left to right and [h - 1, w] downwards. [h, w]."""
+    """Of differences between neighbors: [h, w - 1] from left to right and [h - 1, w] downwards. [h, w]."""
     total = np.zeros((across.shape[0], down.shape[1]), np.result_type(across, down))
     add_divergence(total, across, down)
     return total

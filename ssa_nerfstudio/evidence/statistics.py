@@ -19,7 +19,7 @@ class ImageStatistics:
 
     Integer images are summed in int64 (uint8 in int32 for as long as that holds them), which is exact; in float32,
     E[x^2] - E[x]^2 would cancel at the deviations of 0.05 that matter here. Floating-point images are summed in
-    float64. The same pass keeps the brightness of blocks of neighbouring views, on which detection is built.
+    float64. The same pass keeps the brightness of blocks of neighboring views, on which detection is built.
     """
 
     brightness: BrightnessBlocks
@@ -96,7 +96,7 @@ class ImageStatistics:
         return self._views
 
     def mean(self) -> Tensor:
-        """Mean colour over the views that show the pixel: [H, W, 3] float64 in [0, 1]; 0.5 where none does."""
+        """Mean color over the views that show the pixel: [H, W, 3] float64 in [0, 1]; 0.5 where none does."""
         views = self.views
         mean = self._total().to(torch.float64) / (views.clamp_min(1) * self._scale)
         return torch.where(views > 0, mean, torch.full_like(mean, 0.5))

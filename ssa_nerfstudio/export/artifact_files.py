@@ -69,22 +69,22 @@ def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dic
     color, alpha = layers.straight()
     artifact = layers.covered(threshold)
     straight = np.concatenate([color[..., ::-1], alpha], axis=-1)  # OpenCV's order
-    _write_png(folder / "overlay.png", quantised(straight, np.uint8))
-    _write_png(folder / "overlay_16bit.png", quantised(straight, np.uint16))
-    # Premultiplied, light that hides nothing has its place (unless T differs by channel): colour above alpha.
+    _write_png(folder / "overlay.png", quantized(straight, np.uint8))
+    _write_png(folder / "overlay_16bit.png", quantized(straight, np.uint16))
+    # Premultiplied, light that hides nothing has its place (unless T differs by channel): color above alpha.
     hides = 1 - layers.transmittance.mean(axis=-1, keepdims=True)
     np.save(folder / "overlay_premultiplied.npy", np.concatenate([layers.addition, hides], axis=-1))
-    _write_png(folder / "matte.png", quantised(alpha, np.uint16))
+    _write_png(folder / "matte.png", quantized(alpha, np.uint16))
     _write_png(folder / "mask_white_is_artifact.png", artifact.astype(np.uint8) * 255)
     _write_png(folder / "mask_white_is_scene.png", (~artifact).astype(np.uint8) * 255)
     preview = over_checkerboard(torch.from_numpy(color), torch.from_numpy(alpha)).numpy()
-    _write_png(folder / "preview.png", quantised(preview[..., ::-1], np.uint8))
+    _write_png(folder / "preview.png", quantized(preview[..., ::-1], np.uint8))
     return {
         "frame": layers.frame,
         "overlay": layers.kind,
         "covered_fraction": float(artifact.mean()),
         "mean_matte": float(alpha.mean()),
-        "lost_in_rgba_grey_levels": 255 * _lost(layers, color, alpha),
+        "lost_in_rgba_gray_levels": 255 * _lost(layers, color, alpha),
         "intrinsics": asdict(layers.camera),
     }
 
@@ -99,7 +99,7 @@ def _lost(layers: ArtifactLayers, color: np.ndarray, alpha: np.ndarray) -> float
     return float(np.maximum(np.abs(black), np.abs(white)).mean())
 
 
-def quantised(values: np.ndarray, kind: type[np.unsignedinteger]) -> np.ndarray:
+def quantized(values: np.ndarray, kind: type[np.unsignedinteger]) -> np.ndarray:
     """Values in [0, 1] as integers that use a type's whole range."""
     return np.rint(values.clip(0, 1) * np.float64(np.iinfo(kind).max)).astype(kind)
 

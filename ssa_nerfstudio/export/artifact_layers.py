@@ -38,7 +38,7 @@ class ArtifactLayers:
     """bool [H, W]: False where the crop of the undistorted frame left nothing of the raw one; None: all is known."""
 
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
-        """Straight colour W [H, W, 3] and matte A [H, W, 1], both in [0, 1]."""
+        """Straight color W [H, W, 3] and matte A [H, W, 1], both in [0, 1]."""
         color, alpha = straight_color(torch.from_numpy(self.transmittance), torch.from_numpy(self.addition))
         return color.numpy(), alpha.numpy()
 

@@ -16,7 +16,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 
 LEAST_TRANSMITTANCE = 0.05
-"""A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one grey level would become twenty.
+"""A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one gray level would become twenty.
 Nor is one to which more than 0.95 of white was added: what a photo can still tell is less than that."""
 SAME_ASPECT = 0.005
 """Photos whose aspect differs by less than this, relatively, may be the trained ones at another resolution."""
@@ -33,7 +33,7 @@ class Recovery:
     hidden: float
     """Fraction of pixels behind a matte above 0.95: not recovered, black."""
     implausible: float
-    """Fraction of recovered pixels that came out darker than black or brighter than white by over two grey levels."""
+    """Fraction of recovered pixels that came out darker than black or brighter than white by over two gray levels."""
     clipped: float
     """Fraction of pixels that are recovered as a lower bound: added light made the photo white."""
 

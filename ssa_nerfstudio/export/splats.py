@@ -146,7 +146,7 @@ def _numbered(name: str, values: np.ndarray) -> tuple[list[str], np.ndarray]:
 def write_compressed_ply(path: Path, gaussians: dict[str, Tensor], kept: np.ndarray) -> None:
     """Write PlayCanvas' compressed PLY (read by SuperSplat, PlayCanvas and others) through the library gsply.
 
-    Positions have 11, 10 and 11 bits within chunks of 256 Gaussians, colours and opacity 8, rotations 10, harmonics 8.
+    Positions have 11, 10 and 11 bits within chunks of 256 Gaussians, colors and opacity 8, rotations 10, harmonics 8.
 
     Args:
         path: file to write, its name ending in `.compressed.ply`; replaced when it is complete.
@@ -176,7 +176,7 @@ def write_compressed_ply(path: Path, gaussians: dict[str, Tensor], kept: np.ndar
 
 
 def _harmonics(gaussians: dict[str, Tensor]) -> np.ndarray:
-    """The constant harmonic of each colour, [N, 3]; without harmonics splatfacto's parameter is the colour's logit."""
+    """The constant harmonic of each color, [N, 3]; without harmonics splatfacto's parameter is the color's logit."""
     constant = gaussians["features_dc"].float()
     if gaussians["features_rest"].shape[1]:
         return constant.numpy()

@@ -41,7 +41,7 @@ def ssim(render: Tensor, target: Tensor) -> float:
     """Structural similarity with an 11 x 11 Gaussian window of sigma 1.5 and "valid" padding.
 
     "Valid": only windows that lie wholly inside the image count, so the outer 5 pixels are never a window's
-    centre. torchmetrics, and with it `ns-eval`, pads by reflection instead; its numbers differ slightly. Mean over
+    center. torchmetrics, and with it `ns-eval`, pads by reflection instead; its numbers differ slightly. Mean over
     channels and windows. Wang et al. 2004, "Image quality assessment: from error visibility to structural
     similarity", with K1 = 0.01 and K2 = 0.03.
 
@@ -95,8 +95,8 @@ def flip_arrays(render: Tensor, target: Tensor) -> tuple[np.ndarray, np.ndarray]
     return reference, test
 
 
-def mean_colour_deviation(render: Tensor, target: Tensor) -> float:
-    """Distance between the two images' mean colours, the paper's Delta c-bar.
+def mean_color_deviation(render: Tensor, target: Tensor) -> float:
+    """Distance between the two images' mean colors, the paper's Delta c-bar.
 
     The 2-norm of the difference of mean RGB on the 0..255 scale. It shows a near-uniform tint or exposure
     shift that hardly moves PSNR or SSIM.

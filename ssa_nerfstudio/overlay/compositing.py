@@ -28,15 +28,15 @@ def composite_over_splats(
 ) -> Tensor:
     """`composite`, with a gradient of the matte that sees splats only: an overlay gains nothing by hiding background.
 
-    Where no splat covers a pixel, the render shows the background colour (in splatfacto a random one at every step).
+    Where no splat covers a pixel, the render shows the background color (in splatfacto a random one at every step).
     Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
-    Here the matte is judged as if the overlay's own colour stood behind the splats: there, nothing is gained, sparsity
+    Here the matte is judged as if the overlay's own color stood behind the splats: there, nothing is gained, sparsity
     takes the overlay back, and the scene has to fill the hole.
 
     Args:
         clean: [H, W, 3], the render with its background.
         accumulation: [H, W, 1], opacity of the splats.
-        background: [3], the colour behind them.
+        background: [3], the color behind them.
         transmittance, addition: [H, W, 1] and [H, W, 3] in [0, 1].
 
     Returns:
@@ -58,7 +58,7 @@ def paint(
     Args:
         clean: [H, W, 3], the render with its background.
         color_logits, alpha_logits: W~ [H, W, 3] and A~ [H, W, 1].
-        behind: opacity of the splats [H, W, 1] and colour of the background [3]: the gradient of the matte is that of
+        behind: opacity of the splats [H, W, 1] and color of the background [3]: the gradient of the matte is that of
             `composite_over_splats`; None: that of the picture.
     """
     return _Painted.apply(clean, color_logits, alpha_logits, *(behind or (None, None)))  # pyright: ignore[reportReturnType]

@@ -14,7 +14,7 @@ from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats,
 from ssa_nerfstudio.overlay.resampling import letterbox, reduced_size, stack_premultiplied, to_training_scale
 
 CONSTANT_START = (0.5, 0.1)
-"""Colour and matte of the paper's ablation "constant start"."""
+"""Color and matte of the paper's ablation "constant start"."""
 MATTE_START_RANGE = (0.01, 0.99)
 """The starting matte is clamped to this before the logit: exp(-sigma / s) is exactly 1 where sigma is 0."""
 MATTE_LOGIT_RANGE = (-12.0, math.log(0.999 / 0.001))
@@ -22,9 +22,9 @@ MATTE_LOGIT_RANGE = (-12.0, math.log(0.999 / 0.001))
 and the scene behind an opaque pixel would lose all gradient. 0.999 is 255 in a file of 8 bits, and gsplat's largest
 alpha of one Gaussian. A given artifact has no such range."""
 COLOR_LOGIT_RANGE = (-12.0, 12.0)
-"""While it learns, the colour stays between 6e-6 and 1 - 6e-6, for the same reason."""
+"""While it learns, the color stays between 6e-6 and 1 - 6e-6, for the same reason."""
 COLOR_START_RANGE = (1 / 510, 1 - 1 / 510)
-"""The starting colour is clamped to this before the logit: half a grey level from black and white."""
+"""The starting color is clamped to this before the logit: half a gray level from black and white."""
 
 
 class ScreenSpaceOverlay(nn.Module):
@@ -101,7 +101,7 @@ class ScreenSpaceOverlay(nn.Module):
         self.color_logits.clamp_(*COLOR_LOGIT_RANGE)
 
     def color(self) -> Tensor:
-        """W: straight colour, or the light that is added, [h, w, 3] in (0, 1)."""
+        """W: straight color, or the light that is added, [h, w, 3] in (0, 1)."""
         return torch.sigmoid(self.color_logits)
 
     def matte(self) -> Tensor:
@@ -120,7 +120,7 @@ class ScreenSpaceOverlay(nn.Module):
         Args:
             clean: [H // reduction, W // reduction, 3], the render with its background.
             reduction: 1, 2 or 4: training images are reduced by this.
-            behind: opacity of the splats [..., 1] and colour of the background [3], which the matte then gains nothing
+            behind: opacity of the splats [..., 1] and color of the background [3], which the matte then gains nothing
                 by hiding (`composite_over_splats`); None: plain compositing.
         """
         if self.resolution == reduction == 1 and not self.adds_light:
@@ -184,6 +184,6 @@ class GivenOverlay(nn.Module):
 
 
 def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """An overlay's layers in a frame of any size and aspect: scaled, centred, never stretched; clear around it."""
+    """An overlay's layers in a frame of any size and aspect: scaled, centered, never stretched; clear around it."""
     transmittance, addition = overlay.layers()
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)

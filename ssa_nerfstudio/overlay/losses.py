@@ -21,7 +21,7 @@ and weighted copies a direction (which torch.compile can fuse). The values are t
 LOG_SOFTNESS = 0.1
 """e of the concave penalty log(1 + A / e): below this opacity it acts like l1, above it spares what is opaque."""
 LOG_EVIDENCE_FLOOR = 0.1
-"""Share of the concave penalty that a pixel pays whose colour is the same in all views."""
+"""Share of the concave penalty that a pixel pays whose color is the same in all views."""
 SSIM_WINDOW = 11
 """Side of SSIM's Gaussian window in pixels (sigma 1.5); "valid" padding, as pytorch_msssim."""
 

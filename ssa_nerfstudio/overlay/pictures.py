@@ -12,7 +12,7 @@ _SQUARES = (0.5, 0.35)
 
 
 def over_checkerboard(color: Tensor, alpha: Tensor, side: int = 8) -> Tensor:
-    """A straight-alpha picture over grey squares, on which transparency shows.
+    """A straight-alpha picture over gray squares, on which transparency shows.
 
     Args:
         color: [H, W, 3] in [0, 1].

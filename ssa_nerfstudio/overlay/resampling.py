@@ -1,6 +1,6 @@
 """Resampling of premultiplied layers [H, W, C], pixel-aligned with the way training images are reduced.
 
-Straight colours must not be averaged: a transparent pixel's colour means nothing and would bleed into its neighbours.
+Straight colors must not be averaged: a transparent pixel's color means nothing and would bleed into its neighbors.
 What is averaged here is always the pair (transmittance, added light), in which compositing is linear.
 """
 
@@ -32,7 +32,7 @@ def enlarge(layer: Tensor, factor: int, height: int, width: int) -> Tensor:
 
 
 def letterbox(layer: Tensor, height: int, width: int, fill: float) -> Tensor:
-    """Fit a layer into a frame of any size and aspect: scaled without stretching, centred, `fill` around it.
+    """Fit a layer into a frame of any size and aspect: scaled without stretching, centered, `fill` around it.
 
     Args:
         layer: [H, W, C].
@@ -75,15 +75,15 @@ def to_training_scale(layer: Tensor, resolution: int, reduction: int, height: in
 
 
 def stack_premultiplied(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Straight colour [..., 3] and matte [..., 1] as (transmittance [..., 1], added light [..., 3])."""
+    """Straight color [..., 3] and matte [..., 1] as (transmittance [..., 1], added light [..., 3])."""
     return 1.0 - alpha, alpha * color
 
 
 def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Tensor]:
-    """Undo `stack_premultiplied`: (colour [..., 3], matte [..., 1]); black where the matte is zero.
+    """Undo `stack_premultiplied`: (color [..., 3], matte [..., 1]); black where the matte is zero.
 
     The transmittance may have one channel or three; the matte is one minus its mean. Light that hides nothing has no
-    straight colour: it gets the least matte that can carry it, at most 1.
+    straight color: it gets the least matte that can carry it, at most 1.
     """
     alpha = torch.maximum(1.0 - transmittance.mean(dim=-1, keepdim=True), addition.amax(dim=-1, keepdim=True))
     alpha = alpha.clamp_max(1.0)

@@ -179,7 +179,8 @@ class Artifacts(nn.Module):
             if place is None:
                 there = sorted({(int(width), int(height)) for width, height in known[:, :2].tolist()})
                 raise InputError(
-                    f"the checkpoint was trained on frames (width, height) of {there}, this run has {tuple(key[:2].int().tolist())}",
+                    f"the checkpoint was trained on frames (width, height) of {there}, this run has "
+                    f"{tuple(key[:2].int().tolist())}",
                     "resume with the photos and camera-res-scale-factor of then",
                 )
             places.append(place if place < len(self) else None)

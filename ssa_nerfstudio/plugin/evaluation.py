@@ -35,7 +35,7 @@ def figures_of_step(outputs: Mapping[str, Tensor], target: Tensor, artifacts: Ar
 
 
 def figures_of_view(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, float]:
-    """Of the clean render: psnr (dB), ssim ("valid" padding), mean_colour_deviation, flip; and composite_psnr.
+    """Of the clean render: psnr (dB), ssim ("valid" padding), mean_color_deviation, flip; and composite_psnr.
 
     Args:
         outputs: the model's.
@@ -50,7 +50,7 @@ def figures_but_flip(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str,
     values = {
         "psnr": metrics.psnr(render, target),
         "ssim": metrics.ssim(render, target),
-        "mean_colour_deviation": metrics.mean_colour_deviation(render, target),
+        "mean_color_deviation": metrics.mean_color_deviation(render, target),
     }
     if "composite" in outputs:
         values["composite_psnr"] = metrics.psnr(outputs["composite"], target)

@@ -24,7 +24,7 @@ upstream.bring_ffmpeg()
 
 
 def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:
-    """splatfacto's trainer settings with fused optimisers, an `overlay` group, and less evaluation while training."""
+    """splatfacto's trainer settings with fused optimizers, an `overlay` group, and less evaluation while training."""
     return SSATrainerConfig(
         method_name=name,
         max_num_iterations=30_000,

@@ -51,7 +51,7 @@ class SSASplatfactoModel(SplatfactoModel):
         """Build splatfacto's Gaussians without CUDA and without downloads, then what is ours."""
         points = self.seed_points = guards.usable_points(self.seed_points)
         if points is not None:
-            # Upstream moves seed colours to CUDA (splatfacto.py:261); given none, it starts from random ones.
+            # Upstream moves seed colors to CUDA (splatfacto.py:261); given none, it starts from random ones.
             self.seed_points = (points[0], points[1][:0])
         with without_lpips():
             super().populate_modules()
@@ -105,11 +105,11 @@ class SSASplatfactoModel(SplatfactoModel):
             self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
 
     def k_nearest_sklearn(self, x: Tensor, k: int):
-        """Distances to, and indices of, the k nearest neighbours of points [N, 3]; of fewer where N is too small."""
+        """Distances to, and indices of, the k nearest neighbors of points [N, 3]; of fewer where N is too small."""
         return super().k_nearest_sklearn(x, min(k, len(x) - 1))
 
     def start_outside_cameras(self, positions: Tensor) -> None:
-        """Leave out start points that are inside a camera at positions [V, 3]. Before the optimisers are built."""
+        """Leave out start points that are inside a camera at positions [V, 3]. Before the optimizers are built."""
         outside = guards.outside_cameras(self.means.data, positions)
         if not self.config.guards or outside.all():
             return
@@ -130,7 +130,7 @@ class SSASplatfactoModel(SplatfactoModel):
             overlay.wait_for_the_scene(waiting)
 
     def step_post_backward(self, step: int) -> None:
-        """After the optimisers' step: bring parameters back into their range, then densify."""
+        """After the optimizers' step: bring parameters back into their range, then densify."""
         for overlay in self.artifacts.learned():
             overlay.take_back()
         if self.config.guards and step % guards.RANGE_EVERY == 0:
@@ -142,7 +142,7 @@ class SSASplatfactoModel(SplatfactoModel):
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.
 
-        Parameter objects stay what they are: the optimisers that hold them were built before. (splatfacto replaces
+        Parameter objects stay what they are: the optimizers that hold them were built before. (splatfacto replaces
         them, splatfacto.py:392, and a resumed run then trains nothing.)
         """
         self.step = 30000
@@ -246,7 +246,7 @@ class SSASplatfactoModel(SplatfactoModel):
         }
 
     def _view_matrix(self, camera: Cameras) -> Tensor:
-        """World to camera [1, 4, 4], with the camera optimiser's correction while training."""
+        """World to camera [1, 4, 4], with the camera optimizer's correction while training."""
         if not self.training:
             return view_matrix(camera.camera_to_worlds)
         prepared = metadata(camera).get("viewmat")
@@ -299,7 +299,7 @@ class SSASplatfactoModel(SplatfactoModel):
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Compare one test view with the clean render: psnr (dB), ssim ("valid" padding), flip, mean colour deviation.
+        """Compare one test view with the clean render: psnr (dB), ssim ("valid" padding), flip, mean color deviation.
 
         `composite_psnr` compares what the photo shows with the photo: the figure to read where test photos carry the
         artifact too.

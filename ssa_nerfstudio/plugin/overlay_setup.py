@@ -69,8 +69,8 @@ def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[Give
     for overlay, size in zip(overlays, sizes, strict=True):
         if (overlay.height, overlay.width) != size:
             raise InputError(
-                f"{path} has layers of {overlay.height} x {overlay.width} pixels, the undistorted photos have {size[0]} "
-                f"x {size[1]}",
+                f"{path} has layers of {overlay.height} x {overlay.width} pixels, the undistorted photos have "
+                f"{size[0]} x {size[1]}",
                 "give the layers in the undistorted frame at the training resolution",
             )
     return overlays

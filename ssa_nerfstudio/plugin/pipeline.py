@@ -34,7 +34,7 @@ class SSAPipelineConfig(VanillaPipelineConfig):
 
 
 class SSAPipeline(VanillaPipeline):
-    """`VanillaPipeline` whose model has its overlays before the optimisers are built, which is right after this."""
+    """`VanillaPipeline` whose model has its overlays before the optimizers are built, which is right after this."""
 
     config: SSAPipelineConfig
     datamanager: SSADatamanager
@@ -91,5 +91,5 @@ def _source(config: SSAPipelineConfig) -> Path:
 
 
 def _extent(positions: torch.Tensor) -> float:
-    """Radius of the cameras around their centre, times 1.1 (3DGS's `nerf_normalization`; at least 1e-6)."""
+    """Radius of the cameras around their center, times 1.1 (3DGS's `nerf_normalization`; at least 1e-6)."""
     return max(1e-6, 1.1 * float((positions - positions.mean(dim=0)).norm(dim=1).max()))

@@ -50,14 +50,14 @@ class ModelSettings(SplatfactoModelConfig):
     mcmc_opacity_start: float = 0.5
     """MCMC: opacity of the first Gaussians, in (0, 1)."""
     mcmc_scale_start: float = 0.1
-    """MCMC: size of the first Gaussians relative to the distance of their neighbours."""
+    """MCMC: size of the first Gaussians relative to the distance of their neighbors."""
     mcmc_opacity_regularizer: float = 0.01
     """MCMC: weight of the mean opacity in the loss, which frees Gaussians for relocation."""
     mcmc_scale_regularizer: float = 0.01
     """MCMC: weight of the mean scale (world units) in the loss."""
     scale_by_extent: bool = False
     """ADC: measure split and prune sizes, and the means' learning rate, in units of the cameras' extent (3DGS, the
-    paper) instead of the normalised scene (splatfacto)."""
+    paper) instead of the normalized scene (splatfacto)."""
     pause_after_reset: int | None = None
     """ADC: steps without refinement after an opacity reset; None: one a photo and a refinement's (splatfacto)."""
     guards: bool = True

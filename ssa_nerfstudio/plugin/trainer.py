@@ -64,7 +64,7 @@ class SSATrainer(Trainer):
         return next(usable, candidates[0])
 
     def setup_optimizers(self) -> JointOptimizers:
-        """Optimisers of the configuration; the means' learning rate in units of the scene where the model asks so."""
+        """Optimizers of the configuration; the means' learning rate in units of the scene where the model asks so."""
         self.pipeline.model.metrics_every = max(1, self.config.logging.steps_per_log)
         scale = self.pipeline.model.scene_scale
         if scale != 1.0:
@@ -83,7 +83,7 @@ class SSATrainer(Trainer):
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
         """Set up as upstream does, and say at the end of the training what became of the artifact.
 
-        A resumed run takes over the overlays of its checkpoint: they have to be there before the optimisers are built.
+        A resumed run takes over the overlays of its checkpoint: they have to be there before the optimizers are built.
         """
         self.config.pipeline.artifacts_of = self._resumed_checkpoint()
         super().setup(test_mode)

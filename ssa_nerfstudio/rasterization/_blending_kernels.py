@@ -20,7 +20,7 @@ from numba import njit
 from ssa_nerfstudio.rasterization.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 
 GRADIENTS = 12
-"""Columns of a partial gradient: centre x y, |centre| x y, conic xx xy yy, opacity, colour r g b, depth."""
+"""Columns of a partial gradient: center x y, |center| x y, conic xx xy yy, opacity, color r g b, depth."""
 
 
 @njit(cache=True, nogil=True)
@@ -58,14 +58,14 @@ def assign_bands(bounds, n_bands):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _row_span(dy, xx, xy, yy, reach, centre, x0, x1):
-    """Columns [first, last) of a row at height dy above the centre where the exponent is at most reach / 2."""
+def _row_span(dy, xx, xy, yy, reach, center, x0, x1):
+    """Columns [first, last) of a row at height dy above the center where the exponent is at most reach / 2."""
     discriminant = xy * xy * dy * dy - xx * (yy * dy * dy - reach)
     if not discriminant >= 0.0:
         return 0, 0
     root = math.sqrt(discriminant)
-    left = centre - 0.5 + (-xy * dy - root) / xx
-    right = centre - 0.5 + (-xy * dy + root) / xx
+    left = center - 0.5 + (-xy * dy - root) / xx
+    right = center - 0.5 + (-xy * dy + root) / xx
     first = x0 if left < x0 else (x1 if left > x1 else math.ceil(left))
     last = x1 if right > x1 - 1 else (x0 if right < x0 else math.floor(right) + 1)
     return int(first), int(last)
@@ -73,7 +73,7 @@ def _row_span(dy, xx, xy, yy, reach, centre, x0, x1):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def blend_bands(
-    first_band, step_band, starts, members, centres, conics, opacities, colors, bounds, image, transmittance, last
+    first_band, step_band, starts, members, centers, conics, opacities, colors, bounds, image, transmittance, last
 ):
     """Blend bands first_band, first_band + step_band, ... into image [H, W, 4], transmittance [H, W], last [H, W].
 
@@ -98,7 +98,7 @@ def blend_bands(
             if not (opacity >= ALPHA_MIN and xx > 0.0):
                 continue
             reach = 2.0 * math.log(opacity / ALPHA_MIN)
-            cx, cy = float(centres[v, 0]), float(centres[v, 1])
+            cx, cy = float(centers[v, 0]), float(centers[v, 1])
             ratio = math.exp(-xx)
             r, g, b, d = float(colors[v, 0]), float(colors[v, 1]), float(colors[v, 2]), float(colors[v, 3])
             for y in range(max(top, bounds[v, 2]), min(bottom, bounds[v, 3])):
@@ -141,7 +141,7 @@ def backpropagate_bands(
     starts,
     members,
     slots,
-    centres,
+    centers,
     conics,
     opacities,
     colors,
@@ -181,7 +181,7 @@ def backpropagate_bands(
                 continue
             rank = s - starts[band] + 1
             reach = 2.0 * math.log(opacity / ALPHA_MIN)
-            cx, cy = float(centres[v, 0]), float(centres[v, 1])
+            cx, cy = float(centers[v, 0]), float(centers[v, 1])
             ratio = math.exp(-xx)
             r, g, b, d = float(colors[v, 0]), float(colors[v, 1]), float(colors[v, 2]), float(colors[v, 3])
             v_x = v_y = v_abs_x = v_abs_y = v_xx = v_xy = v_yy = v_opacity = v_r = v_g = v_b = v_d = 0.0

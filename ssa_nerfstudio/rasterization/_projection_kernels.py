@@ -50,7 +50,7 @@ def _limits(K, width, height):
 def project_gaussians(
     thread, threads, means, quats, scales, viewmat, K, width, height, near, far, radius_clip, eps2d, geometry, radii
 ):
-    """Fill geometry [N, 6] (centre x y, conic xx xy yy, depth) and radii [N], 0 where the Gaussian is not drawn."""
+    """Fill geometry [N, 6] (center x y, conic xx xy yy, depth) and radii [N], 0 where the Gaussian is not drawn."""
     n = means.shape[0]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     x_min, x_max, y_min, y_max = _limits(K, width, height)
@@ -195,14 +195,14 @@ def _bases(degree, x, y, z, Y):
 
 
 @njit(cache=True, nogil=True)
-def shade(thread, threads, ids, means, centre, coefficients, degree, colors):
-    """Fill colors [V, 0:3] with max(0, 0.5 + sum_k Y_k c_k) in the direction from the camera's centre [3]."""
+def shade(thread, threads, ids, means, center, coefficients, degree, colors):
+    """Fill colors [V, 0:3] with max(0, 0.5 + sum_k Y_k c_k) in the direction from the camera's center [3]."""
     n = ids.shape[0]
     bases = (degree + 1) ** 2
     Y = np.empty(16)
     for s in range(n * thread // threads, n * (thread + 1) // threads):
         i = ids[s]
-        x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
+        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         norm = max(math.sqrt(x * x + y * y + z * z), NORM_MIN)
         _bases(degree, x / norm, y / norm, z / norm, Y)
         for c in range(3):
@@ -214,7 +214,7 @@ def shade(thread, threads, ids, means, centre, coefficients, degree, colors):
 
 @njit(cache=True, nogil=True)
 def backpropagate_shading(
-    thread, threads, ids, means, centre, coefficients, degree, colors, v_colors, v_means, v_coefficients
+    thread, threads, ids, means, center, coefficients, degree, colors, v_colors, v_means, v_coefficients
 ):
     """Add to v_means [N, 3] and v_coefficients [N, K, 3] what v_colors [V, 0:3] pulls back; none where clamped."""
     n = ids.shape[0]
@@ -222,7 +222,7 @@ def backpropagate_shading(
     Y, dot = np.empty(16), np.zeros(16)
     for s in range(n * thread // threads, n * (thread + 1) // threads):
         i = ids[s]
-        x, y, z = means[i, 0] - centre[0], means[i, 1] - centre[1], means[i, 2] - centre[2]
+        x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         norm = max(math.sqrt(x * x + y * y + z * z), NORM_MIN)
         x, y, z = x / norm, y / norm, z / norm
         _bases(degree, x, y, z, Y)

@@ -52,35 +52,35 @@ def compile_kernels() -> None:
 
 
 class _Blend(torch.autograd.Function):
-    """Autograd's door to the kernels; gradients of the centres arrive at the whole `means2d` [C, N, 2]."""
+    """Autograd's door to the kernels; gradients of the centers arrive at the whole `means2d` [C, N, 2]."""
 
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, ids, radii, camera, width, height, absgrad):  # pyright: ignore
-        centres = np.ascontiguousarray(means2d.detach()[camera, ids].numpy())
+        centers = np.ascontiguousarray(means2d.detach()[camera, ids].numpy())
         arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (conics, opacities, colors)]
-        bounds = _tile_bounds(centres, radii.numpy(), width, height)
+        bounds = _tile_bounds(centers, radii.numpy(), width, height)
         bands = _kernels.assign_bands(bounds, -(-height // TILE))
-        image = np.zeros((height, width, 4), centres.dtype)
-        transmittance = np.ones((height, width), centres.dtype)
+        image = np.zeros((height, width, 4), centers.dtype)
+        transmittance = np.ones((height, width), centers.dtype)
         last = np.zeros((height, width), np.int32)
         starts, members, _ = bands
-        on_all_threads(_kernels.blend_bands, starts, members, centres, *arrays, bounds, image, transmittance, last)
+        on_all_threads(_kernels.blend_bands, starts, members, centers, *arrays, bounds, image, transmittance, last)
         ctx.save_for_backward(means2d, ids)
-        ctx.blended = (bands, centres, arrays, bounds, transmittance, last)
+        ctx.blended = (bands, centers, arrays, bounds, transmittance, last)
         ctx.camera, ctx.absgrad = camera, absgrad
         return torch.from_numpy(image), torch.from_numpy(1 - transmittance[..., None])
 
     @staticmethod
     def backward(ctx, v_image, v_alpha):  # pyright: ignore[reportIncompatibleMethodOverride]
         means2d, ids = ctx.saved_tensors
-        (starts, members, slots), centres, arrays, bounds, transmittance, last = ctx.blended
+        (starts, members, slots), centers, arrays, bounds, transmittance, last = ctx.blended
         partial = np.zeros((len(members), _kernels.GRADIENTS), np.float64)
         on_all_threads(
             _kernels.backpropagate_bands,
             starts,
             members,
             slots,
-            centres,
+            centers,
             *arrays,
             bounds,
             transmittance,
@@ -89,7 +89,7 @@ class _Blend(torch.autograd.Function):
             v_alpha[..., 0].contiguous().numpy(),
             partial,
         )
-        total = np.empty((len(centres), _kernels.GRADIENTS), centres.dtype)
+        total = np.empty((len(centers), _kernels.GRADIENTS), centers.dtype)
         _kernels.sum_partials(slots, partial, total)
         v = torch.from_numpy(total)
         v_means2d = torch.zeros_like(means2d)
@@ -102,13 +102,13 @@ class _Blend(torch.autograd.Function):
         return v_means2d, v[:, 4:7], v[:, 7], v[:, 8:12], None, None, None, None, None, None
 
 
-def _tile_bounds(centres: np.ndarray, radii: np.ndarray, width: int, height: int) -> np.ndarray:
+def _tile_bounds(centers: np.ndarray, radii: np.ndarray, width: int, height: int) -> np.ndarray:
     """Pixel bounds x0, x1, y0, y1 [V, 4] int32 of the tiles that each splat's three-sigma square touches."""
     size = np.array([width, height])
     tiles = -(-size // TILE)
-    lower = np.clip(np.floor((centres - radii[:, None]) / TILE), 0, tiles)
-    upper = np.clip(np.ceil((centres + radii[:, None]) / TILE), 0, tiles)
-    bounds = np.empty((len(centres), 4), np.int32)
+    lower = np.clip(np.floor((centers - radii[:, None]) / TILE), 0, tiles)
+    upper = np.clip(np.ceil((centers + radii[:, None]) / TILE), 0, tiles)
+    bounds = np.empty((len(centers), 4), np.int32)
     bounds[:, 0::2] = lower * TILE
     bounds[:, 1::2] = np.minimum(upper * TILE, size)
     return bounds

@@ -35,7 +35,7 @@ def project(
 ) -> Splats:
     """Same arguments and result as `projection.project`.
 
-    Rare requests go to that one: gradients of the camera (a camera optimiser), antialiasing, harmonics above degree 3.
+    Rare requests go to that one: gradients of the camera (a camera optimizer), antialiasing, harmonics above degree 3.
     """
     if viewmat.requires_grad or K.requires_grad or antialiased or (sh_degree or 0) > HIGHEST_DEGREE:
         return projection.project(
@@ -64,7 +64,7 @@ def project(
 
 
 class _Project(torch.autograd.Function):
-    """Autograd's door to the projection kernels: geometry [V, 6] and colour [V, 3] of the drawn Gaussians."""
+    """Autograd's door to the projection kernels: geometry [V, 6] and color [V, 3] of the drawn Gaussians."""
 
     @staticmethod
     def forward(ctx, means, quats, scales, colors, ids, geometry, arrays, camera, eps2d, sh_degree):  # pyright: ignore
@@ -73,7 +73,7 @@ class _Project(torch.autograd.Function):
             shaded = coefficients[ids.numpy()]
         else:
             shaded = np.empty((len(ids), 3), geometry.dtype)
-            on_all_threads(kernels.shade, ids.numpy(), arrays[0], _centre(camera[0]), coefficients, sh_degree, shaded)
+            on_all_threads(kernels.shade, ids.numpy(), arrays[0], _center(camera[0]), coefficients, sh_degree, shaded)
         ctx.saved = (ids, arrays, coefficients, shaded, camera, eps2d, sh_degree)
         return torch.from_numpy(geometry[ids.numpy()]), torch.from_numpy(shaded)
 
@@ -93,11 +93,11 @@ class _Project(torch.autograd.Function):
         else:
             on_all_threads(
                 kernels.backpropagate_shading,
-                numbers, arrays[0], _centre(camera[0]), coefficients, sh_degree, shaded, v, v_means, v_colors,
+                numbers, arrays[0], _center(camera[0]), coefficients, sh_degree, shaded, v, v_means, v_colors,
             )  # fmt: skip
         return *(torch.from_numpy(g) for g in (v_means, v_quats, v_scales, v_colors)), *[None] * 6
 
 
-def _centre(viewmat: np.ndarray) -> np.ndarray:
+def _center(viewmat: np.ndarray) -> np.ndarray:
     """World position [3] of the camera of a rigid world-to-camera matrix [4, 4]."""
     return -viewmat[:3, :3].T @ viewmat[:3, 3]

@@ -70,8 +70,8 @@ def rasterization(
     if sh_degree is None:
         rgb = colors.expand(n_cameras, -1, -1)
     else:
-        centres = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])  # [C, 3, 1]
-        directions = means - centres.transpose(1, 2)
+        centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])  # [C, 3, 1]
+        directions = means - centers.transpose(1, 2)
         rgb = spherical_harmonics(sh_degree, directions, colors.expand(n_cameras, -1, -1, -1), masks=radii > 0)
         rgb = torch.clamp_min(rgb + 0.5, 0.0)
     channels = rgb

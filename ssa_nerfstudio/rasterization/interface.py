@@ -12,9 +12,9 @@ from ssa_nerfstudio.rasterization import constants
 from ssa_nerfstudio.rasterization.projection import Splats, project
 
 Blend = Callable[[Splats, Tensor, int, int, int, bool], tuple[Tensor, Tensor]]
-"""`blend(splats, means2d, camera, width, height, absgrad)` returns colour and depth [H, W, 4] and alpha [H, W, 1].
+"""`blend(splats, means2d, camera, width, height, absgrad)` returns color and depth [H, W, 4] and alpha [H, W, 1].
 
-`means2d` [C, N, 2] holds the splats' centres at `means2d[camera, splats.ids]`; gradients of the centres go through it,
+`means2d` [C, N, 2] holds the splats' centers at `means2d[camera, splats.ids]`; gradients of the centers go through it,
 because densification reads them there (and, where `absgrad`, their sum of magnitudes as `means2d.absgrad`).
 """
 
@@ -47,15 +47,15 @@ def rasterization_with(
         absgrad: bool = False,
         rasterize_mode: Literal["classic", "antialiased"] = "classic",
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Draw N Gaussians into C pinhole cameras: `gsplat.rasterization` with three colour channels.
+        """Draw N Gaussians into C pinhole cameras: `gsplat.rasterization` with three color channels.
 
         Args:
             means, quats, scales, opacities: the Gaussians: world units; w x y z; standard deviations; [0, 1].
             colors: final RGB [N, 3], or spherical harmonics [N, K, 3] where `sh_degree` is given.
             viewmats, Ks: world to camera (OpenCV axes), intrinsics in pixels.
-            backgrounds: colour behind the splats; black where None.
+            backgrounds: color behind the splats; black where None.
             render_mode: D is alpha-weighted depth, ED the expected depth, along the view axis in world units.
-            absgrad: leave the summed magnitudes of the centres' gradients in `info["means2d"].absgrad`.
+            absgrad: leave the summed magnitudes of the centers' gradients in `info["means2d"].absgrad`.
 
         Returns:
             render [C, H, W, X] with X channels by `render_mode`, alpha [C, H, W, 1], and `info` with what

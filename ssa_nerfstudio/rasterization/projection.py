@@ -1,7 +1,7 @@
-"""From Gaussians in the world to splats on the image: projection, view-dependent colour, culling. Differentiable torch.
+"""From Gaussians in the world to splats on the image: projection, view-dependent color, culling. Differentiable torch.
 
 The mathematics is gsplat's own `_torch_impl`, called and not copied. Gaussians in front of the near plane are selected
-*before* projecting: the perspective division of one at the camera centre yields infinities whose gradients are NaN,
+*before* projecting: the perspective division of one at the camera center yields infinities whose gradients are NaN,
 and culled Gaussians should cost nothing.
 """
 
@@ -28,7 +28,7 @@ class Splats:
 
 def project(
     means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4], w x y z, not necessarily normalised
+    quats: Tensor,  # [N, 4], w x y z, not necessarily normalized
     scales: Tensor,  # [N, 3]
     opacities: Tensor,  # [N]
     colors: Tensor,  # [N, 3] or [N, K, 3]
@@ -84,7 +84,7 @@ def project(
     if sh_degree is None:
         rgb = colors[ids]
     else:
-        directions = means[order] - _camera_centre(viewmat)
+        directions = means[order] - _camera_center(viewmat)
         bases = (sh_degree + 1) ** 2
         rgb = _spherical_harmonics(sh_degree, directions, colors[:, :bases][ids])
         rgb = torch.clamp_min(rgb + 0.5, 0.0)
@@ -109,6 +109,6 @@ class _Selection:
         return values if self.everything else values[self.ids]
 
 
-def _camera_centre(viewmat: Tensor) -> Tensor:
+def _camera_center(viewmat: Tensor) -> Tensor:
     """World position [3] of the camera of a rigid world-to-camera matrix [4, 4]."""
     return -viewmat[:3, :3].T @ viewmat[:3, 3]

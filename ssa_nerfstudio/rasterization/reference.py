@@ -23,31 +23,31 @@ def blend(
     """
     if absgrad:
         raise ValueError("the reference rasterizer has no absgrad; set use_absgrad to False or use the cpu rasterizer")
-    centres = means2d[camera, splats.ids]
-    image = centres.new_zeros(height, width, 4)
-    alpha = centres.new_zeros(height, width, 1)
-    lower = torch.floor((centres.detach() - splats.radii[:, None]) / TILE)
-    upper = torch.ceil((centres.detach() + splats.radii[:, None]) / TILE)
+    centers = means2d[camera, splats.ids]
+    image = centers.new_zeros(height, width, 4)
+    alpha = centers.new_zeros(height, width, 1)
+    lower = torch.floor((centers.detach() - splats.radii[:, None]) / TILE)
+    upper = torch.ceil((centers.detach() + splats.radii[:, None]) / TILE)
     for top in range(0, height, TILE):
         for left in range(0, width, TILE):
             column, row = left // TILE, top // TILE
             touches = (lower[:, 0] <= column) & (upper[:, 0] > column) & (lower[:, 1] <= row) & (upper[:, 1] > row)
             here = torch.nonzero(touches).squeeze(-1)
             bottom, right = min(top + TILE, height), min(left + TILE, width)
-            colour, opaque = _blend_tile(splats, centres, here, top, bottom, left, right)
-            image[top:bottom, left:right] = colour
+            color, opaque = _blend_tile(splats, centers, here, top, bottom, left, right)
+            image[top:bottom, left:right] = color
             alpha[top:bottom, left:right] = opaque
     return image, alpha
 
 
 def _blend_tile(
-    splats: Splats, centres: Tensor, here: Tensor, top: int, bottom: int, left: int, right: int
+    splats: Splats, centers: Tensor, here: Tensor, top: int, bottom: int, left: int, right: int
 ) -> tuple[Tensor, Tensor]:
-    """Colour [h, w, 4] and alpha [h, w, 1] of one tile that the splats `here` [n], nearest first, touch."""
-    y = torch.arange(top, bottom, dtype=centres.dtype, device=centres.device) + 0.5
-    x = torch.arange(left, right, dtype=centres.dtype, device=centres.device) + 0.5
-    dx = x[None, None, :] - centres[here, 0, None, None]
-    dy = y[None, :, None] - centres[here, 1, None, None]
+    """Color [h, w, 4] and alpha [h, w, 1] of one tile that the splats `here` [n], nearest first, touch."""
+    y = torch.arange(top, bottom, dtype=centers.dtype, device=centers.device) + 0.5
+    x = torch.arange(left, right, dtype=centers.dtype, device=centers.device) + 0.5
+    dx = x[None, None, :] - centers[here, 0, None, None]
+    dy = y[None, :, None] - centers[here, 1, None, None]
     xx, xy, yy = (splats.conics[here, k, None, None] for k in range(3))
     sigma = 0.5 * (xx * dx**2 + yy * dy**2) + xy * dx * dy  # [n, h, w]
     alphas = (splats.opacities[here, None, None] * torch.exp(-sigma)).clamp_max(ALPHA_MAX)
@@ -58,8 +58,8 @@ def _blend_tile(
     after = torch.cumprod(1.0 - alphas, dim=0)
     before = torch.cat([torch.ones_like(after[:1]), after[:-1]]) if len(here) else after
     weights = alphas * before
-    colour = torch.einsum("nhw,nc->hwc", weights, splats.colors[here])
-    return colour, weights.sum(dim=0)[..., None]
+    color = torch.einsum("nhw,nc->hwc", weights, splats.colors[here])
+    return color, weights.sum(dim=0)[..., None]
 
 
 rasterization = rasterization_with(blend)

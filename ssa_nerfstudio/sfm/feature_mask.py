@@ -20,7 +20,7 @@ def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np
     """Reads a mask in the polarity that COLMAP and nerfstudio share: black (0) is ignored, all else is used.
 
     Args:
-        path: a picture of the raw frame's shape; one of another size is scaled, nearest neighbour.
+        path: a picture of the raw frame's shape; one of another size is scaled, nearest neighbor.
         width, height: of the photos, pixels.
         inverted: whether white marks the artifact instead.
 
@@ -32,18 +32,18 @@ def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np
     """
     try:
         with Image.open(path) as image:
-            grey = np.asarray(image.convert("L"))
+            gray = np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError) as error:
         raise InputError(
             f"{path} cannot be read as a mask ({error})", "give a picture, black where to ignore"
         ) from error
     # A mask learned at a reduced size has rounded sides.
-    if abs(grey.shape[1] * height - grey.shape[0] * width) > max(width, height):
+    if abs(gray.shape[1] * height - gray.shape[0] * width) > max(width, height):
         raise InputError(
-            f"{path} is {grey.shape[1]} x {grey.shape[0]}, the photos are {width} x {height}",
+            f"{path} is {gray.shape[1]} x {gray.shape[0]}, the photos are {width} x {height}",
             "give a mask of the raw frame",
         )
-    used = (grey > 0) != inverted
+    used = (gray > 0) != inverted
     if used.shape != (height, width):
         used = cv2.resize(used.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return checked(used, str(path))

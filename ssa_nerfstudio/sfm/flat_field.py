@@ -38,7 +38,7 @@ _ROWS = 32
 def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray | None:
     """The static factor of photos of one size, up to a constant and slow variations; None where nothing is static.
 
-    Reads at most 64 of them, evenly spaced, in grey; memory is proportional to their number and size.
+    Reads at most 64 of them, evenly spaced, in gray; memory is proportional to their number and size.
 
     Args:
         photos: files, at least 1.
@@ -48,7 +48,7 @@ def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray | None:
         Its natural logarithm, float32 [H, W], smaller than the photos where they exceed `max_size`.
     """
     step = max(1, -(-len(photos) // _MOST_PHOTOS))
-    stack = np.stack([_grey(path, max_size) for path in photos[::step]])
+    stack = np.stack([_gray(path, max_size) for path in photos[::step]])
     _, height, width = stack.shape
     divergence = np.zeros((height, width), dtype=np.float32)
     certain = 0
@@ -91,14 +91,14 @@ def write_flattened(source: Path, target: Path, factor: np.ndarray) -> None:
     part.replace(target)
 
 
-def _grey(path: Path, max_size: int) -> np.ndarray:
+def _gray(path: Path, max_size: int) -> np.ndarray:
     # Not turned: a photo's frame is that of its pixels.
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    scale = max_size / max(grey.shape)
+    gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    scale = max_size / max(gray.shape)
     if scale < 1:
-        size = max(1, round(grey.shape[1] * scale)), max(1, round(grey.shape[0] * scale))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-    return grey
+        size = max(1, round(gray.shape[1] * scale)), max(1, round(gray.shape[0] * scale))
+        gray = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+    return gray
 
 
 def _typical(gradients: np.ndarray) -> tuple[np.ndarray, int]:

@@ -31,7 +31,7 @@ def test_the_table_has_a_row_for_each_effect_and_says_what_there_are_no_views_fo
     assert lines[-1].startswith("| `scene` | dashboard | 1 of 1, opaque, ")
 
 
-def test_neighbouring_views_come_from_three_places_and_each_is_counted(clean, capsys):
+def test_neighboring_views_come_from_three_places_and_each_is_counted(clean, capsys):
     assert stretches(16, 4) == [{0, 1, 2, 3}, {6, 7, 8, 9}, {12, 13, 14, 15}]
     assert spread(16, 4) == {0, 5, 10, 15}
     Command((clean.root,), effects=("dashboard",), views=(8, 17, 12), contiguous=True, seeds=2).run()

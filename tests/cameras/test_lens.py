@@ -22,7 +22,7 @@ from ssa_nerfstudio.experiments.simulation.corruption import undistorted_layers
 
 GOPRO_LIKE = Lens(212, 120, 110.0, 103.0, 106.0, 60.0, (-0.18, 0.024, 0, 0, 0.0005, 0.0008))
 DEVIATION = {"rain": 16.0, "mud": 2.5}
-"""Grey levels by which 99.9 % of all pixels deviate at most; 1.5 for the other effects."""
+"""Gray levels by which 99.9 % of all pixels deviate at most; 1.5 for the other effects."""
 
 
 def by_nerfstudio(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -71,13 +71,13 @@ def test_real_photos_come_out_as_nerfstudio_undistorts_them(captures):
 @given(
     size=st.tuples(st.integers(30, 120), st.integers(30, 120)),
     focal=st.floats(0.5, 2),
-    centre=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
+    center=st.tuples(st.floats(-3, 3), st.floats(-3, 3)),
     coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 2, *[st.floats(-0.01, 0.01)] * 2),
     fisheye=st.booleans(),
 )
-def test_any_lens_comes_out_as_in_nerfstudio(size, focal, centre, coefficients, fisheye):
+def test_any_lens_comes_out_as_in_nerfstudio(size, focal, center, coefficients, fisheye):
     k1, k2, p1, p2 = coefficients
-    (width, height), (x, y) = size, centre
+    (width, height), (x, y) = size, center
     middle = (width / 2 + x, height / 2 + y)
     focals = (focal * width, focal * width * 0.97)
     if fisheye:
@@ -147,7 +147,7 @@ def test_undistorted_layers_form_the_undistorted_photo(effect, captures):
     assert np.percentile(deviation, 99.9) < DEVIATION.get(effect, 1.5)
 
 
-def test_straight_colour_must_not_be_warped():
+def test_straight_color_must_not_be_warped():
     """Why the layers are premultiplied: a white disc on black ground keeps its edge white."""
     y, x = np.mgrid[:120, :212]
     matte = (np.hypot(x - 40, y - 40) < 20).astype(np.float32)[..., None]

@@ -132,13 +132,13 @@ def test_pairs_are_of_different_photos_each_once_and_connect_all(counts):
     assert len({frozenset(pair) for pair in sequential}) == len(sequential)
     assert all(one != other for one, other in sequential)
     reached = {names[0]}
-    neighbours: dict[str, set[str]] = {name: set() for name in names}
+    neighbors: dict[str, set[str]] = {name: set() for name in names}
     for one, other in sequential:
-        neighbours[one].add(other)
-        neighbours[other].add(one)
+        neighbors[one].add(other)
+        neighbors[other].add(one)
     left = [names[0]]
     while left:
-        new = neighbours[left.pop()] - reached
+        new = neighbors[left.pop()] - reached
         reached |= new
         left += new
     assert reached == {*names}

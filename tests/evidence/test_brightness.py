@@ -1,4 +1,4 @@
-"""Blocks of neighbouring views: their means against plain averages, however many views and whatever their type."""
+"""Blocks of neighboring views: their means against plain averages, however many views and whatever their type."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def noise(views: int, height: int, width: int) -> torch.Tensor:
 
 @settings(max_examples=25, deadline=None)
 @given(views=st.integers(1, 100))
-def test_blocks_hold_neighbouring_views_and_all_of_equal_number(views):
+def test_blocks_hold_neighboring_views_and_all_of_equal_number(views):
     images = noise(views, 3, 4)
     blocks = BrightnessBlocks(3, 4)
     for image in images:

@@ -218,7 +218,7 @@ def test_vignetting_alone_is_smooth_and_raises_no_alarm():
 
 
 def test_below_the_faintest_gradient_nothing_counts():
-    """A pattern of one grey level on equal photos: all views agree to the bit, and nobody could see it."""
+    """A pattern of one gray level on equal photos: all views agree to the bit, and nobody could see it."""
     photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     photo[::2] += 1
     assert detect(statistics_of([photo] * 20)).verdict == "none"

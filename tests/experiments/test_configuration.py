@@ -142,8 +142,8 @@ def test_names_and_files_are_found(tmp_path):
         ("effects: [{effect: rain, intensity: 2}]", "effects[0]: Rain.intensity must be in (0, 1], got 2.0"),
         ("effects: [{effect: rain, intensity: .nan}]", "effects[0]: Rain.intensity must be in (0, 1], got nan"),
         ("effects: [{effect: rain, intensity: lots}]", "effects[0]: Rain.intensity must be a number, got 'lots'"),
-        ("effects: [{effect: mud, colour: [1, 2]}]", "effects[0]: Mud.colour must be a list of 3 values, got [1, 2]"),
-        ("effects: [{effect: mud, colour: [1, 2, 256]}]", "effects[0]: Mud.colour must be three numbers in 0..255"),
+        ("effects: [{effect: mud, color: [1, 2]}]", "effects[0]: Mud.color must be a list of 3 values, got [1, 2]"),
+        ("effects: [{effect: mud, color: [1, 2, 256]}]", "effects[0]: Mud.color must be three numbers in 0..255"),
         (
             "effects: [{effect: finger, side: middle}]",
             "effects[0]: Finger.side must be one of left, right, top, bottom",
@@ -172,7 +172,8 @@ def test_configurations_are_installed_with_the_package(tmp_path):
     built = tmp_path / "built"
     command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path), "build_py"]
     subprocess.run([*command, "--build-lib", str(built)], cwd=REPOSITORY, check=True, capture_output=True)
-    code = "from ssa_nerfstudio.experiments.configuration import shipped as s; print(*s('effects').values(), *s('scenes').values())"
+    code = "from ssa_nerfstudio.experiments.configuration import shipped as s; "
+    code += "print(*s('effects').values(), *s('scenes').values())"
     environment = {**os.environ, "PYTHONPATH": str(built)}
     found = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, capture_output=True, text=True

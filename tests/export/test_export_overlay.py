@@ -56,7 +56,7 @@ def read_rgba(path: Path) -> np.ndarray:
 
 
 def laid_over(rgba: np.ndarray, photo: np.ndarray) -> np.ndarray:
-    """What a picture editor makes of it, in grey levels."""
+    """What a picture editor makes of it, in gray levels."""
     alpha = rgba[..., 3:]
     return 255 * alpha * rgba[..., :3] + (1 - alpha) * photo
 
@@ -67,7 +67,7 @@ def photo(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray
 
 
 @pytest.mark.parametrize("effect", ["watermark", "ui", "dashboard", "mud", "dust", "vignette"])
-def test_a_given_artifact_comes_back_within_a_grey_level(tmp_path, effect):
+def test_a_given_artifact_comes_back_within_a_gray_level(tmp_path, effect):
     layers = draw(effect)
     export(write_run(tmp_path / "run", one_camera(given(layers))), tmp_path / "out")
     truth = layers.apply(photo()).astype(float)
@@ -118,8 +118,8 @@ def test_light_that_no_rgba_picture_can_hold_is_reported(tmp_path):
         export(write_run(tmp_path / name, one_camera(given(layers))), tmp_path / f"out-{name}")["cameras"][0]
         for name, layers in (("rain", rain), ("mark", mark))
     ]
-    assert lost[0]["lost_in_rgba_grey_levels"] > 1
-    assert lost[1]["lost_in_rgba_grey_levels"] < 0.01
+    assert lost[0]["lost_in_rgba_gray_levels"] > 1
+    assert lost[1]["lost_in_rgba_gray_levels"] < 0.01
 
 
 def shining() -> ScreenSpaceOverlay:
@@ -149,7 +149,7 @@ def test_light_is_exported_with_the_least_matte_that_carries_it(tmp_path):
     artifact = np.asarray(Image.open(tmp_path / "out" / "mask_white_is_artifact.png")) > 0
     np.testing.assert_array_equal(artifact, least[..., 0] > 0.5)
     assert about["covered_fraction"] == pytest.approx(600 / (WIDTH * HEIGHT))
-    assert about["lost_in_rgba_grey_levels"] == pytest.approx(255 * (least - hides).mean(), rel=1e-3)
+    assert about["lost_in_rgba_gray_levels"] == pytest.approx(255 * (least - hides).mean(), rel=1e-3)
     premultiplied = np.load(tmp_path / "out" / "overlay_premultiplied.npy")
     np.testing.assert_allclose(premultiplied, np.concatenate([light, hides], -1), atol=1e-6)
     given_again = np.load(tmp_path / "out" / "layers.npz")
@@ -248,7 +248,7 @@ def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(captures
     target = undistorted(lens)
     known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > 0.999
     error = np.abs(laid_over(read_rgba(tmp_path / "out" / "overlay.png"), clean) - raw.apply(clean))[known]
-    print(f"{effect}: mean {error.mean():.3f}, 99th percentile {np.percentile(error, 99):.2f} grey levels")
+    print(f"{effect}: mean {error.mean():.3f}, 99th percentile {np.percentile(error, 99):.2f} gray levels")
     assert error.mean() < 2
     assert np.percentile(error, 99) < highest
 

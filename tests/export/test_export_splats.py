@@ -21,7 +21,7 @@ def export(config: Path, output: Path, *options: object) -> Path:
     return output / "splat.ply"
 
 
-@pytest.fixture(scope="module", params=[3, 0], ids=["harmonics", "plain-colours"])
+@pytest.fixture(scope="module", params=[3, 0], ids=["harmonics", "plain-colors"])
 def run(request, tiny_scene, tmp_path_factory) -> Path:
     """A trained run, some of whose Gaussians no exporter may write."""
     folder = tmp_path_factory.mktemp("run")

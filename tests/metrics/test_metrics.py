@@ -20,7 +20,7 @@ def random_pair(
     return (target + noise * torch.randn(height, width, 3, generator=generator)).clamp(0, 1), target
 
 
-IMAGE_METRICS = (metrics.psnr, metrics.ssim, metrics.flip, metrics.mean_colour_deviation)
+IMAGE_METRICS = (metrics.psnr, metrics.ssim, metrics.flip, metrics.mean_color_deviation)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -57,7 +57,7 @@ def test_ssim_of_one_window_by_hand() -> None:
     assert metrics.ssim(dark, bright) == pytest.approx(expected, abs=1e-9)
 
 
-def test_ssim_does_not_centre_windows_in_the_margin() -> None:
+def test_ssim_does_not_center_windows_in_the_margin() -> None:
     render, target = random_pair(height=21, width=21)
     cornered = render.clone()
     cornered[0, 0] = 1 - cornered[0, 0]
@@ -83,15 +83,15 @@ def test_flip_takes_any_memory_layout_and_precision() -> None:
     assert metrics.flip(render, strided) == metrics.flip(render, target)
 
 
-def test_mean_colour_deviation_by_hand() -> None:
+def test_mean_color_deviation_by_hand() -> None:
     target = torch.full((6, 7, 3), 0.4)
     render = target + torch.tensor([3.0, 4.0, 0.0]) / 255
-    assert metrics.mean_colour_deviation(render, target) == pytest.approx(5.0, abs=1e-4)
+    assert metrics.mean_color_deviation(render, target) == pytest.approx(5.0, abs=1e-4)
 
 
-def test_mean_colour_deviation_ignores_where_the_colours_are() -> None:
+def test_mean_color_deviation_ignores_where_the_colors_are() -> None:
     render, _ = random_pair()
-    assert metrics.mean_colour_deviation(render.flip(0), render) == pytest.approx(0.0, abs=1e-9)
+    assert metrics.mean_color_deviation(render.flip(0), render) == pytest.approx(0.0, abs=1e-9)
 
 
 def test_identical_images() -> None:
@@ -99,7 +99,7 @@ def test_identical_images() -> None:
     assert metrics.psnr(image, image) == math.inf
     assert metrics.ssim(image, image) == pytest.approx(1.0, abs=1e-12)
     assert metrics.flip(image, image) == 0.0
-    assert metrics.mean_colour_deviation(image, image) == 0.0
+    assert metrics.mean_color_deviation(image, image) == 0.0
 
 
 @pytest.mark.parametrize("metric", IMAGE_METRICS)

@@ -10,7 +10,7 @@ from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 
 def scene(accumulation: float) -> tuple[ScreenSpaceOverlay, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """A grey-blue overlay over splats of the same colour and the given opacity, in front of a red background."""
+    """A gray-blue overlay over splats of the same color and the given opacity, in front of a red background."""
     overlay = ScreenSpaceOverlay(4, 5).double()
     color = torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
     with torch.no_grad():
@@ -22,7 +22,7 @@ def scene(accumulation: float) -> tuple[ScreenSpaceOverlay, torch.Tensor, torch.
 
 
 def matte_gradient(accumulation: float, over_splats: bool) -> torch.Tensor:
-    """How the error to a photo of the overlay's colour changes with the matte."""
+    """How the error to a photo of the overlay's color changes with the matte."""
     overlay, clean, opacity, background = scene(accumulation)
     transmittance, addition = overlay.layers()
     if over_splats:
@@ -55,7 +55,7 @@ def test_where_splats_are_opaque_the_gradient_is_the_plain_one():
     torch.testing.assert_close(matte_gradient(1.0, True), matte_gradient(1.0, False), rtol=1e-12, atol=1e-15)
 
 
-def test_splats_and_colour_get_the_plain_gradient():
+def test_splats_and_color_get_the_plain_gradient():
     overlay, clean, opacity, background = scene(0.4)
     gradients = []
     for function in (

@@ -51,7 +51,7 @@ def test_a_new_overlay_has_the_constant_start_of_the_paper() -> None:
     assert (overlay.evidence == 1).all()
 
 
-def test_colour_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_over_0_05() -> None:
+def test_color_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_over_0_05() -> None:
     photos, statistics = capture(9, 13)
     overlay = ScreenSpaceOverlay(9, 13)
     initialize(overlay, statistics)
@@ -98,7 +98,7 @@ def test_black_white_and_constant_pixels_start_with_finite_logits() -> None:
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(resolution: int) -> None:
+def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_color(resolution: int) -> None:
     photo = torch.full((4, 4, 3), 51, dtype=torch.uint8)
     once, never = torch.ones(4, 4, dtype=torch.bool), torch.ones(4, 4, dtype=torch.bool)
     once[:2] = False
@@ -115,7 +115,7 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_colour(
     torch.testing.assert_close(matte[2:, 2:], torch.full((2, 2, 1), 0.99))
 
 
-def test_a_start_of_coarser_resolution_averages_the_premultiplied_colours() -> None:
+def test_a_start_of_coarser_resolution_averages_the_premultiplied_colors() -> None:
     photos, statistics = capture(8, 12)
     overlay = ScreenSpaceOverlay(8, 12, 2)
     initialize(overlay, statistics)
@@ -145,7 +145,7 @@ def test_statistics_of_another_frame_are_refused() -> None:
 
 
 def area_of(opaque: np.ndarray, near: np.ndarray, matte: float, difference: float, light: bool = False) -> StaticArea:
-    """An area that is opaque here, and has a matte and a difference in colour near its edges."""
+    """An area that is opaque here, and has a matte and a difference in color near its edges."""
     here = torch.from_numpy(near)
     return StaticArea(
         inside=here,
@@ -195,8 +195,8 @@ def test_what_the_edges_imply_is_what_the_layers_start_from(resolution: int) -> 
     assert (overlay.near[..., 0].numpy() == np.repeat([[1, 0]], 8 // resolution, axis=1)).all()
 
 
-def test_where_edges_imply_nothing_the_overlay_starts_in_the_colour_that_it_has_elsewhere() -> None:
-    """A dark drop and a bright one, of the same colour; a third was missed."""
+def test_where_edges_imply_nothing_the_overlay_starts_in_the_color_that_it_has_elsewhere() -> None:
+    """A dark drop and a bright one, of the same color; a third was missed."""
     color, scene = torch.tensor([0.6, 0.3, 0.1]), torch.tensor([0.3, 0.7]).repeat_interleave(4)[:, None, None]
     photos = [(255 * scene.expand(8, 16, 3)).to(torch.uint8)] * 2
     matte = torch.zeros(8, 16)
@@ -218,7 +218,7 @@ def test_where_edges_imply_nothing_the_overlay_starts_in_the_colour_that_it_has_
     torch.testing.assert_close(overlay.matte()[..., 0], matte.clamp_min(0.1), atol=1e-3, rtol=0)
 
 
-def test_what_is_opaque_or_only_coloured_keeps_its_own_colour_and_what_is_opaque_lends_it_to_nobody() -> None:
+def test_what_is_opaque_or_only_colored_keeps_its_own_color_and_what_is_opaque_lends_it_to_nobody() -> None:
     """From left to right: an opaque board, a drop, an edge too faint for a matte, nothing."""
     _, statistics = capture(6, 12)
     mean = statistics.mean().float()

@@ -45,7 +45,7 @@ def test_reducing_twice_by_two_is_reducing_once_by_four(height: int, width: int)
     torch.testing.assert_close(box_reduce(box_reduce(layer, 2), 2), box_reduce(layer, 4))
 
 
-def test_enlarging_interpolates_between_pixel_centres_and_keeps_the_corner() -> None:
+def test_enlarging_interpolates_between_pixel_centers_and_keeps_the_corner() -> None:
     ramp = torch.arange(5, dtype=torch.float64)[None, :, None].expand(3, 5, 1)
     enlarged = enlarge(ramp, 2, 6, 9)
     assert enlarged.shape == (6, 9, 1)
@@ -74,7 +74,7 @@ def test_a_constant_layer_stays_constant_at_any_training_scale(
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 1000), least=st.sampled_from([1e-3, 0.1, 1.0]))
-def test_straight_colour_and_matte_come_back_from_the_premultiplied_pair(seed: int, least: float) -> None:
+def test_straight_color_and_matte_come_back_from_the_premultiplied_pair(seed: int, least: float) -> None:
     color, alpha = random(5, 6, 3, seed=seed), least + (1 - least) * random(5, 6, 1, seed=seed + 1)
     transmittance, addition = stack_premultiplied(color, alpha)
     color_again, alpha_again = straight_color(transmittance, addition)
@@ -82,7 +82,7 @@ def test_straight_colour_and_matte_come_back_from_the_premultiplied_pair(seed: i
     torch.testing.assert_close(color_again, color, rtol=0, atol=1e-12)
 
 
-def test_the_premultiplied_pair_comes_back_from_straight_colour_and_matte() -> None:
+def test_the_premultiplied_pair_comes_back_from_straight_color_and_matte() -> None:
     alpha = random(5, 6, 1)
     alpha[:2] = 0
     transmittance, addition = 1 - alpha, alpha * random(5, 6, 3, seed=1)
@@ -91,7 +91,7 @@ def test_the_premultiplied_pair_comes_back_from_straight_colour_and_matte() -> N
     torch.testing.assert_close(again[1], addition, rtol=0, atol=1e-15)
 
 
-def test_where_the_matte_is_zero_the_colour_is_black_and_a_coloured_transmittance_counts_by_its_mean() -> None:
+def test_where_the_matte_is_zero_the_color_is_black_and_a_colored_transmittance_counts_by_its_mean() -> None:
     color, alpha = straight_color(torch.ones(2, 2, 1), torch.zeros(2, 2, 3))
     assert (color == 0).all()
     assert (alpha == 0).all()

@@ -43,7 +43,7 @@ def losses(data: Path, output: Path, overlay: str, steps: int = 50) -> tuple[lis
 
 
 def test_a_clean_scene_pays_for_nothing(clean_scene, tmp_path):
-    """No parameter, optimiser or output of an overlay, and 50 steps whose losses are overlay-off's bit for bit."""
+    """No parameter, optimizer or output of an overlay, and 50 steps whose losses are overlay-off's bit for bit."""
     off, _ = losses(clean_scene, tmp_path, "off")
     auto, trainer = losses(clean_scene, tmp_path, "auto")
     assert auto == off

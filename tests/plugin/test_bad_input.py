@@ -19,7 +19,7 @@ from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_ev
 
 def refusal(capsys: pytest.CaptureFixture, run: Callable) -> str:
     """The one line with which `run` is refused."""
-    with pytest.raises(InputError) as caught:
+    with pytest.raises(InputError):
         run()
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("ssa-nerfstudio: error:")]
     assert len(lines) == 1

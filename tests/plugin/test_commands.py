@@ -94,7 +94,7 @@ def test_tensorboard_gets_the_artifact_as_pictures_and_figures(config):
 def test_eval_writes_the_metrics_of_the_clean_render(config, tmp_path):
     command("ns-eval", "--load-config", config, "--output-path", tmp_path / "eval.json")
     results = json.loads((tmp_path / "eval.json").read_text())["results"]
-    assert {"psnr", "ssim", "flip", "mean_colour_deviation", "composite_psnr"} <= results.keys()
+    assert {"psnr", "ssim", "flip", "mean_color_deviation", "composite_psnr"} <= results.keys()
     assert results["psnr"] > results["composite_psnr"]
 
 
@@ -105,7 +105,7 @@ def test_render_dataset_writes_every_layer(config, tmp_path):
     )
     pictures = {name: np.asarray(Image.open(next((tmp_path / "test" / name).iterdir()))) for name in names}
     assert all(picture.shape[:2] == (48, 64) for picture in pictures.values())
-    # ns-render draws one channel in the colour map "turbo": 1 is red, 0 is blue.
+    # ns-render draws one channel in the color map "turbo": 1 is red, 0 is blue.
     red, _, blue = np.moveaxis(pictures["overlay_alpha"].astype(int), -1, 0)
     assert (red > blue)[40:].mean() > 0.95
     assert (red < blue)[:20].mean() > 0.95

@@ -105,7 +105,7 @@ def test_a_checkpoint_reloads_without_opening_a_photo(trained, kind):
 
 def test_metrics_are_of_the_clean_render_and_complete(trained):
     outcome, _, _ = trained["on"]
-    assert {"psnr", "ssim", "flip", "mean_colour_deviation", "composite_psnr"} <= outcome.metrics.keys()
+    assert {"psnr", "ssim", "flip", "mean_color_deviation", "composite_psnr"} <= outcome.metrics.keys()
     # The test views are clean: with the artifact drawn in front they fit worse.
     assert outcome.metrics["psnr"] > outcome.metrics["composite_psnr"] + 1.0
     assert "lpips" not in outcome.metrics
@@ -186,7 +186,7 @@ def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path
     assert drift.abs().max() < 4 * 0.0051
 
 
-def test_light_in_front_of_the_photos_is_recognised_learned_and_reloaded(broken_scene, tmp_path):
+def test_light_in_front_of_the_photos_is_recognized_learned_and_reloaded(broken_scene, tmp_path):
     """Spots that add to the scene: the model adds light, clips as a photo does, and a reloaded one still does."""
     rng = np.random.default_rng(0)
     spots = np.zeros((48, 64, 3), np.uint8)
@@ -281,7 +281,7 @@ def test_a_shorter_run_is_seen_too(steps, stated, between):
     assert scaled(config).steps_per_eval_image == between
 
 
-def test_every_optimiser_is_scale_free():
+def test_every_optimizer_is_scale_free():
     for config in METHODS.values():
         assert all(entry["optimizer"].eps == 1e-15 for entry in config.optimizers.values())
 

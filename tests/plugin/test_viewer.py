@@ -80,7 +80,7 @@ def test_a_model_without_an_artifact_has_no_elements(pipelines):
     assert not [path for path, _ in parse_object(pipelines["off"], ViewerElement, "") if "overlay" in path]
 
 
-def test_the_elements_add_nothing_to_checkpoints_and_optimisers(model):
+def test_the_elements_add_nothing_to_checkpoints_and_optimizers(model):
     assert not [name for name in model.state_dict() if "controls" in name or name.startswith("overlay")]
 
 

@@ -53,7 +53,7 @@ def test_a_single_gaussian_agrees(dtype: torch.dtype) -> None:
 
 @both_dtypes
 @pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
-def test_colours_and_harmonics_of_every_degree_agree(sh_degree: int | None, dtype: torch.dtype) -> None:
+def test_colors_and_harmonics_of_every_degree_agree(sh_degree: int | None, dtype: torch.dtype) -> None:
     made = scene(150, 37, 29, sh_degree=sh_degree, seed=5)
     assert_cpu_agrees_with_reference(made, 37, 29, dtype, sh_degree=sh_degree)
 
@@ -99,7 +99,7 @@ def test_two_cameras_agree_with_each_option(options: dict[str, Any], dtype: torc
 
 
 @both_dtypes
-def test_opaque_gaussians_on_pixel_centres_agree_where_alpha_is_clamped(dtype: torch.dtype) -> None:
+def test_opaque_gaussians_on_pixel_centers_agree_where_alpha_is_clamped(dtype: torch.dtype) -> None:
     gaussians, viewmats, Ks = scene(60, 16, 16, size=0.3, seed=3)
     gaussians["opacities"] = torch.ones(60, dtype=torch.float64)
     pixels = torch.randint(0, 16, (60, 2), generator=torch.Generator().manual_seed(0)) + 0.5

@@ -52,7 +52,7 @@ def assert_projections_agree(made: Scene, dtype: torch.dtype = torch.float64, **
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("sh_degree", [None, 0, 1, 2, 3])
-def test_splats_and_gradients_agree_for_colours_and_every_degree(sh_degree: int | None, dtype: torch.dtype) -> None:
+def test_splats_and_gradients_agree_for_colors_and_every_degree(sh_degree: int | None, dtype: torch.dtype) -> None:
     gaussians, _, Ks = scene(200, WIDTH, HEIGHT, sh_degree=sh_degree, seed=1)
     if sh_degree is not None:
         gaussians["colors"] *= 3  # so that some channels are clamped at black
@@ -126,7 +126,7 @@ def test_splats_come_nearest_first_and_equal_depths_in_order_of_their_index() ->
 
 
 @pytest.mark.parametrize("name", ["viewmats", "Ks"])
-def test_a_camera_that_is_optimised_gets_its_gradient_from_the_cpu_rasterizer(name: str) -> None:
+def test_a_camera_that_is_optimized_gets_its_gradient_from_the_cpu_rasterizer(name: str) -> None:
     gaussians, viewmats, Ks = scene(80, WIDTH, HEIGHT, cameras=2, seed=7)
     gradients = {}
     for body, rasterization in BODIES.items():

@@ -139,7 +139,7 @@ def test_absgrad_is_left_out_unless_asked_for_and_changes_nothing_else() -> None
 def test_gaussians_at_behind_and_just_before_the_camera_leave_gradients_finite(name: str, dtype: torch.dtype) -> None:
     gaussians, viewmats, Ks = scene(60, 32, 24, size=0.2, dtype=dtype)
     near = 0.01
-    gaussians["means"][0] = 0  # at the camera's centre
+    gaussians["means"][0] = 0  # at the camera's center
     gaussians["means"][1] = torch.tensor([0.3, 0.1, 0.0])  # in its plane: divided by a depth of zero
     gaussians["means"][2] = torch.tensor([0.1, 0.1, -2.0])
     gaussians["means"][3] = torch.tensor([0.0, 0.0, near])  # on the near plane: not drawn

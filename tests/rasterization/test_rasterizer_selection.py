@@ -49,7 +49,7 @@ def test_what_only_cuda_can_do_is_refused(name: str, option: dict[str, Any]) -> 
 @pytest.mark.parametrize(
     ("shape", "sh_degree"), [((3, 3), 0), ((3, 16, 3), None), ((3, 4), None), ((3, 16, 4), 3)], ids=str
 )
-def test_colours_of_another_shape_are_refused(name: str, shape: tuple[int, ...], sh_degree: int | None) -> None:
+def test_colors_of_another_shape_are_refused(name: str, shape: tuple[int, ...], sh_degree: int | None) -> None:
     gaussians, viewmats, Ks = scene(3, 8, 8)
     gaussians["colors"] = torch.zeros(shape, dtype=torch.float64)
     with pytest.raises(ValueError, match="together with sh_degree"):

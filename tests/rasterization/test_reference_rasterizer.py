@@ -20,7 +20,7 @@ DEFAULTS = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 
 def draw_pixel_by_pixel(
     made: Scene, width: int, height: int, antialiased: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Colour, depth, alpha by gsplat's formulas in numpy, and the number of pixels where the transmittance ran out."""
+    """Color, depth, alpha by gsplat's formulas in numpy, and the number of pixels where the transmittance ran out."""
     gaussians = {name: value.numpy() for name, value in made[0].items()}
     viewmat, K = made[1][0].numpy(), made[2][0].numpy()
     splats = []
@@ -37,12 +37,12 @@ def draw_pixel_by_pixel(
         covariance = sharp + constants.EPS2D * np.eye(2)
         if antialiased:
             opacity = opacity * math.sqrt(np.linalg.det(sharp) / np.linalg.det(covariance))
-        centre = np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
+        center = np.array([K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]])
         spread = max(0.1, 0.5 * np.diff(np.linalg.eigvalsh(covariance))[0])
         half = math.ceil(3 * math.sqrt(0.5 * np.trace(covariance) + spread))
-        if (centre + half <= 0).any() or (centre - half >= (width, height)).any():
+        if (center + half <= 0).any() or (center - half >= (width, height)).any():
             continue
-        splats.append((z, centre, half, np.linalg.inv(covariance), opacity, color))
+        splats.append((z, center, half, np.linalg.inv(covariance), opacity, color))
     splats.sort(key=lambda splat: splat[0])
     stopped = 0
     image, depth, alphas = np.zeros((height, width, 3)), np.zeros((height, width)), np.zeros((height, width))
@@ -50,10 +50,10 @@ def draw_pixel_by_pixel(
         for column in range(width):
             transmittance = 1.0
             tile = np.array([column // 16, row // 16])
-            for z, centre, half, inverse, opacity, color in splats:
-                if (np.floor((centre - half) / 16) > tile).any() or (np.ceil((centre + half) / 16) <= tile).any():
+            for z, center, half, inverse, opacity, color in splats:
+                if (np.floor((center - half) / 16) > tile).any() or (np.ceil((center + half) / 16) <= tile).any():
                     continue
-                offset = np.array([column + 0.5, row + 0.5]) - centre
+                offset = np.array([column + 0.5, row + 0.5]) - center
                 alpha = min(0.999, opacity * math.exp(-0.5 * offset @ inverse @ offset))
                 if alpha < 1 / 255:
                     continue
@@ -96,10 +96,10 @@ def test_a_splat_ends_with_the_last_tile_that_its_three_sigma_square_touches(
     size, radius = 64, 22
     _, viewmats, _ = scene(1, size, size)
     Ks = torch.tensor([[[64, 0, 32], [0, 64, 32], [0, 0, 1]]], dtype=torch.float64)
-    centre = 32 - (radius + gap) * np.array(side)  # the square ends (just) before the middle, where a tile begins
+    center = 32 - (radius + gap) * np.array(side)  # the square ends (just) before the middle, where a tile begins
     one = torch.ones(1, 3, dtype=torch.float64)
     gaussians = {
-        "means": torch.tensor([[*(centre - 32) / 16, 4]], dtype=torch.float64),  # 16 pixels are a unit there
+        "means": torch.tensor([[*(center - 32) / 16, 4]], dtype=torch.float64),  # 16 pixels are a unit there
         "quats": torch.tensor([[1, 0, 0, 0]], dtype=torch.float64),
         "scales": torch.tensor([[7 / 16, 7 / 16, 0]], dtype=torch.float64),
         "opacities": one[:, 0],
@@ -109,14 +109,14 @@ def test_a_splat_ends_with_the_last_tile_that_its_three_sigma_square_touches(
     render, _, info = BODIES[name](**gaussians, viewmats=viewmats, Ks=Ks, width=size, height=size)
     assert info["radii"].item() == radius
     np.testing.assert_allclose(render[0].numpy(), image, atol=1e-12)
-    x, y = centre
+    x, y = center
     rows, columns = np.indices((size, size)) + 0.5
     everywhere = np.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * (7**2 + 0.3)))
     assert ((everywhere > 1 / 255) & (alphas == 0)).any(), "nothing is cut off"
 
 
 def smooth_scene(width: int, height: int) -> Scene:
-    """Three Gaussians wider than the image; all alphas, transmittances and colours are away from the cut-offs."""
+    """Three Gaussians wider than the image; all alphas, transmittances and colors are away from the cut-offs."""
     gaussians, _, Ks = scene(3, width, height, size=1.6, seed=4, sh_degree=1)
     gaussians["opacities"] = 0.3 + 0.4 * gaussians["opacities"]
     gaussians["colors"] = 0.3 * gaussians["colors"]

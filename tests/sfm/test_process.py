@@ -16,7 +16,7 @@ from PIL import Image
 from plyfile import PlyData
 from small_captures import HEIGHT, WIDTH, photos, poses, write
 
-from benchmarks.alignment import centre_errors
+from benchmarks.alignment import center_errors
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
@@ -55,7 +55,7 @@ def test_all_photos_of_both_passes_are_registered_in_one_frame(two_pass):
     assert sorted(found) == sorted(names)
     true = poses(VIEWS)
     extent = np.linalg.norm(true[:, :3, 3] - true[:, :3, 3].mean(axis=0), axis=1).mean()
-    errors = centre_errors(np.array([found[name][:3, 3] for name in names]), true[:, :3, 3])
+    errors = center_errors(np.array([found[name][:3, 3] for name in names]), true[:, :3, 3])
     assert errors.max() < 0.02 * extent
     # Directions too: between two views the rotation is the true one.
     for one, other in zip(range(VIEWS - 1), range(1, VIEWS), strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_captures import HEIGHT, WIDTH, photos, poses, write
 
-from benchmarks.alignment import centre_errors, similarity
+from benchmarks.alignment import center_errors, similarity
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.experiments.effects.mud import Mud
 from ssa_nerfstudio.sfm.photos_to_dataset import process
@@ -81,7 +81,7 @@ def _error(dataset: Path, true: np.ndarray) -> float:
     found = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
     numbers = [int(Path(frame["source_name"]).stem.removeprefix("photo_")) for frame in frames]
     extent = np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
-    return float(centre_errors(found, true[numbers]).max() / extent)
+    return float(center_errors(found, true[numbers]).max() / extent)
 
 
 def test_similarities_are_recovered():
@@ -95,6 +95,6 @@ def test_similarities_are_recovered():
         np.testing.assert_allclose(found, rotation, atol=1e-12)
         np.testing.assert_allclose(scale, 2.5)
         np.testing.assert_allclose(translation, [1, 2, 3], atol=1e-12)
-        assert centre_errors(points, moved).max() < 1e-12
+        assert center_errors(points, moved).max() < 1e-12
         # A mirrored shape is another: no rotation hides it.
-        assert centre_errors(points * [1, 1, -1], points).max() > 0.1
+        assert center_errors(points * [1, 1, -1], points).max() > 0.1

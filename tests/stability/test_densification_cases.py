@@ -1,4 +1,4 @@
-"""Hard cases of both densifications: what is left must be finite, and as many as its optimisers know of."""
+"""Hard cases of both densifications: what is left must be finite, and as many as its optimizers know of."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Optimizers = dict[str, torch.optim.Optimizer]
 
 
 def gaussians(n: int) -> tuple[Params, Optimizers]:
-    """Ordinary Gaussians, alive, with optimisers that have made a step."""
+    """Ordinary Gaussians, alive, with optimizers that have made a step."""
     generator = torch.Generator().manual_seed(n)
     shapes = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "features_dc": (n, 3), "opacities": (n, 1)}
     params = Params({k: torch.nn.Parameter(0.5 * torch.randn(s, generator=generator)) for k, s in shapes.items()})
@@ -144,7 +144,7 @@ def _(densify) -> None:
     densify(params, optimizers)
 
 
-@both("a single Gaussian", "Statistics of one, and neighbours of none.")
+@both("a single Gaussian", "Statistics of one, and neighbors of none.")
 def _(densify) -> None:
     densify(*gaussians(1))
 

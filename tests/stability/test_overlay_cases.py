@@ -49,9 +49,9 @@ def step(overlay: ScreenSpaceOverlay, clean: Tensor, photo: Tensor, kind: Sparsi
     40.0,
     0.0,
 )
-@OVERLAY.case("matte logits of -40", "Premultiplied colour of 4e-18 is divided by its matte.", -40.0, 0.0)
-@OVERLAY.case("colour logits of +40", "A colour of exactly 1.", 0.0, 40.0)
-@OVERLAY.case("colour logits of -40", "A colour of exactly 0.", 0.0, -40.0)
+@OVERLAY.case("matte logits of -40", "Premultiplied color of 4e-18 is divided by its matte.", -40.0, 0.0)
+@OVERLAY.case("color logits of +40", "A color of exactly 1.", 0.0, 40.0)
+@OVERLAY.case("color logits of -40", "A color of exactly 0.", 0.0, -40.0)
 @OVERLAY.case("all logits of +40", "An opaque white frame: nothing of the scene is left.", 40.0, 40.0)
 @OVERLAY.case("all logits of -40", "No artifact at all.", -40.0, -40.0)
 def _saturated(alpha: float, color: float) -> None:
@@ -248,7 +248,7 @@ def _odd_sizes(seed: int, height: int, width: int, to_height: int, to_width: int
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10_000))
 def _straight(seed: int) -> None:
-    """Premultiplying and back gives colour and matte again wherever there is a matte."""
+    """Premultiplying and back gives color and matte again wherever there is a matte."""
     color, alpha = random(4, 5, 3, seed=seed), random(4, 5, 1, seed=seed + 1) * 0.99 + 0.01
     again, matte = straight_color(*stack_premultiplied(color, alpha))
     torch.testing.assert_close(matte, alpha, atol=1e-6, rtol=0)
@@ -256,9 +256,9 @@ def _straight(seed: int) -> None:
 
 
 OVERLAY.case("any compositing", "Values leave [0, 1], or two overlays are not one.")(_compositing)
-OVERLAY.case("any reduction", "Filtering straight colours leaks a clear pixel's colour into its neighbours.")(_energy)
+OVERLAY.case("any reduction", "Filtering straight colors leaks a clear pixel's color into its neighbors.")(_energy)
 OVERLAY.case("any size and back", "Resampling rings, or drifts.")(_odd_sizes)
-OVERLAY.case("any colour and matte, premultiplied and back", "The division by the matte loses the colour.")(_straight)
+OVERLAY.case("any color and matte, premultiplied and back", "The division by the matte loses the color.")(_straight)
 
 
 @OVERLAY.parametrize

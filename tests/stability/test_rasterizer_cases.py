@@ -81,7 +81,7 @@ def without(scene: Gaussians, index: int = 0) -> Gaussians:
 @RASTERIZER.case("a Gaussian behind the camera", "A division by a negative depth mirrors it into the image.", -2.0)
 @RASTERIZER.case("a Gaussian far behind", "The same at a depth of -1e6.", -1e6)
 @RASTERIZER.case("a Gaussian on the near plane", "Drawn by one body and not by the other.", NEAR_PLANE)
-@RASTERIZER.case("a Gaussian at the camera's centre", "A division by a depth of 0.", 0.0)
+@RASTERIZER.case("a Gaussian at the camera's center", "A division by a depth of 0.", 0.0)
 @RASTERIZER.case(
     "a Gaussian just before the near plane", "Magnified without bounds where it must not be drawn.", NEAR_PLANE - 1e-6
 )
@@ -103,7 +103,7 @@ def _culled(depth: float) -> None:
     [5.0, 0.0, NEAR_PLANE + 1e-4],
 )
 @RASTERIZER.case("a Gaussian 1e6 away", "Its depth swamps the others'.", [0.0, 0.0, 1e6])
-@RASTERIZER.case("a Gaussian 1e6 to the side", "Its centre is beyond any integer of pixels.", [1e6, 0.0, 3.0])
+@RASTERIZER.case("a Gaussian 1e6 to the side", "Its center is beyond any integer of pixels.", [1e6, 0.0, 3.0])
 def _placed(mean: list[float]) -> None:
     hold(among_others(means=mean), tolerance=1e-6)
 
@@ -194,8 +194,8 @@ def _focal(focal: float) -> None:
     hold(gaussians(20), focal=focal, tolerance=1e-5)
 
 
-@RASTERIZER.case("harmonics of 1e4", "Colours far above 1 and gradients of their directions of 1e4.", 1e4)
-@RASTERIZER.case("harmonics of -1e4", "Every colour is clamped to 0.", -1e4)
+@RASTERIZER.case("harmonics of 1e4", "Colors far above 1 and gradients of their directions of 1e4.", 1e4)
+@RASTERIZER.case("harmonics of -1e4", "Every color is clamped to 0.", -1e4)
 @RASTERIZER.case("harmonics of 1e12", "Far beyond anything that can be learned.", 1e12)
 def _harmonics(size: float) -> None:
     scene = gaussians(20)
@@ -264,9 +264,9 @@ def _background(seed: int, x: float, y: float) -> None:
     Ks = torch.tensor([[[30.0, 0, 17], [0, 30.0, 11], [0, 0, 1]]], dtype=torch.float64)
 
     def on(value: float) -> Tensor:
-        grey = torch.full((1, 3), value, dtype=torch.float64)
+        gray = torch.full((1, 3), value, dtype=torch.float64)
         viewmats = torch.eye(4, dtype=torch.float64)[None]
-        options = {"width": WIDTH, "height": HEIGHT, "sh_degree": 3, "backgrounds": grey}
+        options = {"width": WIDTH, "height": HEIGHT, "sh_degree": 3, "backgrounds": gray}
         return cpu.rasterization(**scene, viewmats=viewmats, Ks=Ks, **options)[0]
 
     torch.testing.assert_close(on((x + y) / 2), (on(x) + on(y)) / 2, atol=1e-12, rtol=0)

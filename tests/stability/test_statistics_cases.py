@@ -126,7 +126,7 @@ def _float(noise: float) -> None:
     started(statistics)
 
 
-@STATISTICS.case("a hot pixel", "A sensor's hot pixel is static and is to become artifact; its neighbours are not.")
+@STATISTICS.case("a hot pixel", "A sensor's hot pixel is static and is to become artifact; its neighbors are not.")
 def _() -> None:
     noisy = photos(60)
     noisy[:, 3, 4] = 255
@@ -156,7 +156,7 @@ def _() -> None:
     assert torch.equal(a.color(), b.color())
 
 
-@STATISTICS.case("a frame of one pixel", "No window, no edge and no neighbour exists.", (1, 1, 3))
+@STATISTICS.case("a frame of one pixel", "No window, no edge and no neighbor exists.", (1, 1, 3))
 @STATISTICS.case("a frame of one row", "Gradients across rows do not exist.", (1, 9, 3))
 @STATISTICS.case("a frame of one column", "Gradients along rows do not exist.", (9, 1, 3))
 def _small(size: tuple[int, int, int]) -> None:

@@ -144,8 +144,8 @@ for _share in (1.0, 0.6, 0.3):
                 assert boundary == 0 or matte_of(model)[: max(1, boundary - 1)].mean() < 0.5
 
 
-@TRAINING.case("black photos", "Colours of 0, an SSIM of 0 over 0, a mean of 0.", 0)
-@TRAINING.case("white photos", "Colours of 1, and a background that explains everything.", 255)
+@TRAINING.case("black photos", "Colors of 0, an SSIM of 0 over 0, a mean of 0.", 0)
+@TRAINING.case("white photos", "Colors of 1, and a background that explains everything.", 255)
 def _flat(value: int, folder: Path) -> None:
     outcome, _ = train(dataset(folder / "scene", edit=repaint(value)), overlay="on")
     assert outcome.metrics["composite_psnr"] > 15
@@ -189,7 +189,7 @@ for _factor in (1e-3, 1e3):
         assert outcome.metrics["psnr"] > 10
 
     @TRAINING.case(
-        f"a scene of {_factor:g} times the size, not normalised",
+        f"a scene of {_factor:g} times the size, not normalized",
         "Depths below the near plane, or steps a thousandth of what they should be.",
         _factor,
     )
@@ -211,14 +211,14 @@ for _method in ("ssa-splatfacto", "ssa-splatfacto-mcmc"):
 
 
 @TRAINING.case(
-    "points all in one place", "No distance to a neighbour: a log scale of minus infinity.", lambda xyz: 0 * xyz
+    "points all in one place", "No distance to a neighbor: a log scale of minus infinity.", lambda xyz: 0 * xyz
 )
-@TRAINING.case("two points", "Fewer than the neighbours that a size is made of.", lambda xyz: xyz[:2])
-@TRAINING.case("a single point", "No neighbour at all.", lambda xyz: xyz[:1])
+@TRAINING.case("two points", "Fewer than the neighbors that a size is made of.", lambda xyz: xyz[:2])
+@TRAINING.case("a single point", "No neighbor at all.", lambda xyz: xyz[:1])
 @TRAINING.case("no points", "Nothing to start from.", lambda xyz: xyz[:0])
 @TRAINING.case(
     "points that are not finite",
-    "One NaN spoils the search for neighbours.",
+    "One NaN spoils the search for neighbors.",
     lambda xyz: np.where(np.arange(len(xyz))[:, None] % 7 == 0, np.nan, xyz),
 )
 @TRAINING.case(

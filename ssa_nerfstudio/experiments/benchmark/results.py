@@ -16,7 +16,8 @@ from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 
 FORMAT = "ssa-nerfstudio benchmark run"
 """Marks a file as one of ours."""
-VERSION = 1
+VERSION = 2
+"""Version 1 spelled the key `mean_color_deviation` another way; it is read, too."""
 Status = Literal["finished", "diverged", "failed"]
 
 
@@ -30,7 +31,7 @@ class Result:
     reason: str = ""
     """Of a run that did not finish."""
     metrics: dict[str, float] = field(default_factory=dict)
-    """Means over the test views: psnr (dB), ssim ("valid" padding), flip, mean_colour_deviation (0..255), ..."""
+    """Means over the test views: psnr (dB), ssim ("valid" padding), flip, mean_color_deviation (0..255), ..."""
     views: dict[str, dict[str, float]] = field(default_factory=dict)
     """The same of each test view by its file's name."""
     artifact: dict[str, float] = field(default_factory=dict)
@@ -89,6 +90,8 @@ def read(path: Path) -> Result:
         raise InputError(f"{path} is no whole JSON ({error}): truncated?") from error
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise InputError(f"{path} is not a result of ssa bench")
+    if values.get("version") == 1:
+        values = _renamed(values, "mean_colour_deviation", "mean_color_deviation") | {"version": VERSION}
     if values.get("version") != VERSION:
         raise InputError(f"{path} is of version {values.get('version')!r}, this reads version {VERSION}")
     try:
@@ -199,3 +202,10 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def _renamed(value: Any, old: str, new: str) -> Any:
+    """A copy of JSON in which every key `old` is `new`."""
+    if isinstance(value, dict):
+        return {new if key == old else key: _renamed(item, old, new) for key, item in value.items()}
+    return [_renamed(item, old, new) for item in value] if isinstance(value, list) else value

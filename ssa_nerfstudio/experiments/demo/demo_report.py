@@ -16,7 +16,7 @@ from rich.table import Table
 from ssa_nerfstudio.experiments.demo.comparison import Comparison, Demonstration
 
 COLUMNS = (("psnr", "PSNR dB", "{:.2f}"), ("ssim", "SSIM", "{:.3f}"), ("flip", "FLIP", "{:.3f}"),
-           ("mean_colour_deviation", "mean colour deviation", "{:.2f}"))  # fmt: skip
+           ("mean_color_deviation", "mean color deviation", "{:.2f}"))  # fmt: skip
 """Metric, heading, format; higher is better for the first two."""
 CORRUPTED = (
     "The test photos of this capture carry the artifact too (its transforms.json names no clean test_filenames): "

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -26,22 +26,22 @@ class Dashboard:
     """Fraction of the frame's height covered at the highest point, in (0, 0.5]."""
     softness: float = 1.5
     """Width of the ramp from opaque to absent along the edge, pixels, in [0.5, 50]."""
-    panel_colour: Colour = (64, 60, 58)
+    panel_color: Color = (64, 60, 58)
     """Padded panel, sRGB, 0..255."""
-    cluster_colour: Colour = (20, 21, 24)
+    cluster_color: Color = (20, 21, 24)
     """Instrument cluster, sRGB, 0..255."""
-    dial_colour: Colour = (214, 218, 222)
+    dial_color: Color = (214, 218, 222)
     """Rims and ticks of the gauges, sRGB, 0..255."""
-    needle_colour: Colour = (222, 58, 36)
+    needle_color: Color = (222, 58, 36)
     """Needles of the gauges, sRGB, 0..255."""
-    wheel_colour: Colour = (32, 31, 33)
+    wheel_color: Color = (32, 31, 33)
     """Steering wheel, sRGB, 0..255."""
-    screen_colour: Colour = (46, 92, 128)
+    screen_color: Color = (46, 92, 128)
     """Screen in the middle of the car, sRGB, 0..255."""
 
     def __post_init__(self) -> None:
         require(self, height="(0, 0.5]", softness="[0.5, 50]")
-        require_colours(self, *(f"{part}_colour" for part in ("panel", "cluster", "dial", "needle", "wheel", "screen")))
+        require_colors(self, *(f"{part}_color" for part in ("panel", "cluster", "dial", "needle", "wheel", "screen")))
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
         """The dashboard at one frame size.
@@ -52,7 +52,7 @@ class Dashboard:
             rng: sets the needles and the grain of the panel.
 
         Returns:
-            T = 1 - A and B = A W, with A the matte and W the dashboard's colours.
+            T = 1 - A and B = A W, with A the matte and W the dashboard's colors.
         """
         painter = _Painter(height, width, self.height * height)
         x, y = painter.x, painter.y
@@ -63,42 +63,42 @@ class Dashboard:
         top = np.maximum(crest, hood)
 
         grain = 1 + 0.05 * rng.standard_normal((height, width))
-        painter.fill(self.panel_colour)
+        painter.fill(self.panel_color)
         painter.shade(grain * (0.62 + 0.65 * np.clip(y / top, 0, 1)))
         # A seam below the upper edge and a lit lip make the panel read as a solid.
-        painter.paint(self.dial_colour, np.abs(y - top + 0.035) - 0.012, opacity=0.25)
-        painter.paint(self.cluster_colour, np.abs(y - crest + 0.42) - 0.014, opacity=0.8)
+        painter.paint(self.dial_color, np.abs(y - top + 0.035) - 0.012, opacity=0.25)
+        painter.paint(self.cluster_color, np.abs(y - crest + 0.42) - 0.014, opacity=0.8)
 
-        painter.paint(self.cluster_colour, _rounded_box(x - driver, y - 0.43, 1.02, 0.44, 0.3))
+        painter.paint(self.cluster_color, _rounded_box(x - driver, y - 0.43, 1.02, 0.44, 0.3))
         for offset, tilt in zip((-0.47, 0.47), rng.uniform(-0.45, 0.45, 2), strict=True):
             self._paint_gauge(painter, driver + offset, tilt * np.pi)
 
         right = 0.16 * painter.aspect
-        painter.paint(self.cluster_colour, _rounded_box(x - right, y - 0.3, 0.52, 0.33, 0.08))
-        painter.paint(self.screen_colour, _rounded_box(x - right, y - 0.3, 0.45, 0.26, 0.04))
+        painter.paint(self.cluster_color, _rounded_box(x - right, y - 0.3, 0.52, 0.33, 0.08))
+        painter.paint(self.screen_color, _rounded_box(x - right, y - 0.3, 0.45, 0.26, 0.04))
         route = np.abs(y - 0.3 - 0.12 * np.sin(6 * (x - right))) - 0.025
-        painter.paint(self.dial_colour, np.maximum(route, np.abs(x - right) - 0.42), opacity=0.8)
+        painter.paint(self.dial_color, np.maximum(route, np.abs(x - right) - 0.42), opacity=0.8)
         vent = _rounded_box(x - 0.37 * painter.aspect, y - 0.34, 0.34, 0.17, 0.06)
-        painter.paint(self.cluster_colour, np.maximum(vent, 0.03 - np.abs((y - 0.34) % 0.11 - 0.055)))
+        painter.paint(self.cluster_color, np.maximum(vent, 0.03 - np.abs((y - 0.34) % 0.11 - 0.055)))
 
         radius = np.hypot(x - driver, (y + 1.04) * 0.96)
-        painter.paint(self.wheel_colour, np.abs(radius - 1.42) - 0.1)
-        painter.paint(self.dial_colour, np.abs(radius - 1.475) - 0.012, opacity=0.35)
+        painter.paint(self.wheel_color, np.abs(radius - 1.42) - 0.1)
+        painter.paint(self.dial_color, np.abs(radius - 1.475) - 0.012, opacity=0.35)
 
         ramp = self.softness / painter.unit
-        return Layers.composited(np.clip((top - y) / ramp, 0, 1), painter.colour)
+        return Layers.composited(np.clip((top - y) / ramp, 0, 1), painter.color)
 
-    def _paint_gauge(self, painter: _Painter, centre: float, angle: float) -> None:
+    def _paint_gauge(self, painter: _Painter, center: float, angle: float) -> None:
         """One dial with its rim, ticks and a needle turned by `angle` radians from upright."""
-        x, y = painter.x - centre, painter.y - 0.5
+        x, y = painter.x - center, painter.y - 0.5
         radius, turn = np.hypot(x, y), np.arctan2(x, y)
-        painter.paint(self.dial_colour, np.abs(radius - 0.36) - 0.022)
+        painter.paint(self.dial_color, np.abs(radius - 0.36) - 0.022)
         step = np.pi / 6
         off_tick = np.abs((turn + step / 2) % step - step / 2) * radius - 0.018
-        painter.paint(self.dial_colour, np.maximum(off_tick, np.abs(radius - 0.285) - 0.04))
+        painter.paint(self.dial_color, np.maximum(off_tick, np.abs(radius - 0.285) - 0.04))
         along, across = x * np.sin(angle) + y * np.cos(angle), x * np.cos(angle) - y * np.sin(angle)
-        painter.paint(self.needle_colour, np.maximum(np.abs(across) - 0.025, np.abs(along - 0.11) - 0.16))
-        painter.paint(self.needle_colour, radius - 0.055)
+        painter.paint(self.needle_color, np.maximum(np.abs(across) - 0.025, np.abs(along - 0.11) - 0.16))
+        painter.paint(self.needle_color, radius - 0.055)
 
 
 class _Painter:
@@ -111,22 +111,22 @@ class _Painter:
         self.aspect = max(width / unit, 4.4)
         self.x = ((np.arange(width) + 0.5) / width - 0.5)[None, :] * self.aspect
         self.y = ((height - np.arange(height) - 0.5) / unit)[:, None]
-        self.colour = np.zeros((height, width, 3))
+        self.color = np.zeros((height, width, 3))
 
-    def fill(self, colour: Colour) -> None:
-        self.colour[:] = np.array(colour) / 255
+    def fill(self, color: Color) -> None:
+        self.color[:] = np.array(color) / 255
 
     def shade(self, factor: np.ndarray) -> None:
-        self.colour = np.clip(self.colour * factor[..., None], 0, 1)
+        self.color = np.clip(self.color * factor[..., None], 0, 1)
 
-    def paint(self, colour: Colour, distance: np.ndarray, opacity: float = 1.0) -> None:
-        """Composites a colour where `distance` [height, width], in units, is negative."""
+    def paint(self, color: Color, distance: np.ndarray, opacity: float = 1.0) -> None:
+        """Composites a color where `distance` [height, width], in units, is negative."""
         coverage = opacity * np.clip(0.5 - distance * self.unit, 0, 1)[..., None]
-        self.colour += coverage * (np.array(colour) / 255 - self.colour)
+        self.color += coverage * (np.array(color) / 255 - self.color)
 
 
 def _rounded_box(x: np.ndarray, y: np.ndarray, half_width: float, half_height: float, radius: float) -> np.ndarray:
-    """Signed distance to a rectangle with rounded corners, centred at the origin."""
+    """Signed distance to a rectangle with rounded corners, centered at the origin."""
     outside_x, outside_y = np.abs(x) - half_width + radius, np.abs(y) - half_height + radius
     corner = np.hypot(np.maximum(outside_x, 0), np.maximum(outside_y, 0))
     return corner + np.minimum(np.maximum(outside_x, outside_y), 0) - radius

@@ -59,13 +59,13 @@ class Dust:
     def _add_speck(self, transmittance: np.ndarray, radius: float, rng: np.random.Generator) -> None:
         """Multiplies one speck into T [H, W]."""
         height, width = transmittance.shape
-        centre_x, centre_y, density = rng.uniform(0, width), rng.uniform(0, height), self._density(rng)
+        center_x, center_y, density = rng.uniform(0, width), rng.uniform(0, height), self._density(rng)
         squeeze, turn = rng.uniform(0.7, 1), rng.uniform(0, np.pi)
         reach = 2 * radius + 1
-        rows = slice(max(0, int(centre_y - reach)), min(height, int(centre_y + reach) + 1))
-        columns = slice(max(0, int(centre_x - reach)), min(width, int(centre_x + reach) + 1))
-        y = np.arange(rows.start, rows.stop)[:, None] + 0.5 - centre_y
-        x = np.arange(columns.start, columns.stop)[None, :] + 0.5 - centre_x
+        rows = slice(max(0, int(center_y - reach)), min(height, int(center_y + reach) + 1))
+        columns = slice(max(0, int(center_x - reach)), min(width, int(center_x + reach) + 1))
+        y = np.arange(rows.start, rows.stop)[:, None] + 0.5 - center_y
+        x = np.arange(columns.start, columns.stop)[None, :] + 0.5 - center_x
         along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
         distance = np.hypot(along, across / squeeze) - radius
         edge = max(1.0, self.softness * radius)

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ssa_nerfstudio.experiments.effects.layers import Layers, VaryingLayers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 
 _OUTWARD = {"left": (-1, 0), "right": (1, 0), "top": (0, -1), "bottom": (0, 1)}
 
@@ -17,7 +17,7 @@ _OUTWARD = {"left": (-1, 0), "right": (1, 0), "top": (0, -1), "bottom": (0, 1)}
 class Finger:
     """A stand-in for the paper's real "Finger" captures: a finger anchored to the frame's edge.
 
-    Formation in view i: I = T C + B_i with T = 1 - A, the same in all views, and B_i = A W_i. The finger's colour W_i
+    Formation in view i: I = T C + B_i with T = 1 - A, the same in all views, and B_i = A W_i. The finger's color W_i
     is its skin under light that changes in brightness, tint and direction from view to view.
 
     Raises:
@@ -36,7 +36,7 @@ class Finger:
     """Width of the defocused edge as a fraction of the frame's shorter side, in (0, 0.5]."""
     opacity: float = 0.98
     """Opacity inside the edge, in (0, 1]."""
-    colour: tuple[int, int, int] = (182, 124, 102)
+    color: tuple[int, int, int] = (182, 124, 102)
     """Skin in the mean light, sRGB, 0..255."""
     variation: float = 0.08
     """Standard deviation, from view to view, of the light's brightness relative to its mean, in [0, 0.5]."""
@@ -53,7 +53,7 @@ class Finger:
             opacity="(0, 1]",
             variation="[0, 0.5]",
         )
-        require_colours(self, "colour")
+        require_colors(self, "color")
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> VaryingLayers:
         """The finger at one frame size.
@@ -85,7 +85,7 @@ class Finger:
         matte, along, across = matte[box], along[box] / radius, np.clip(across[box] / radius, -1.5, 1.5)
         # Blood lets red light through where the finger is thin, and the nail's end is paler.
         thinness = np.clip(1.1 + distance[box] / radius, 0, 1)[..., None] ** 2
-        skin = (np.array(self.colour) / 255 * (1 + thinness * [0.3, 0.1, 0.06])).astype(np.float32)
+        skin = (np.array(self.color) / 255 * (1 + thinness * [0.3, 0.1, 0.06])).astype(np.float32)
         body = (1 - 0.28 * across**2 - 0.06 * np.clip(along, 0, 3)).astype(np.float32)
         across, along = across.astype(np.float32), np.clip(along, -1, 2).astype(np.float32)
 
@@ -94,7 +94,7 @@ class Finger:
                 self.variation * np.clip(rng.standard_normal(6), -2.5, 2.5)
             ).tolist()
             light = body + slope_across * across + 0.5 * slope_along * along
-            colour = light[..., None] * skin * ((1 + gain) * (1 + 0.3 * np.array(tint, np.float32)))
-            return Layers.composited(matte, np.clip(colour, 0, 1))
+            color = light[..., None] * skin * ((1 + gain) * (1 + 0.3 * np.array(tint, np.float32)))
+            return Layers.composited(matte, np.clip(color, 0, 1))
 
         return VaryingLayers(box, view)

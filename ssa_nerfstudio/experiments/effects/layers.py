@@ -38,15 +38,15 @@ class Layers:
             raise ValueError(f"transmittance {self.transmittance.shape} and addition {self.addition.shape} differ")
 
     @classmethod
-    def composited(cls, matte: np.ndarray, colour: np.ndarray) -> Layers:
+    def composited(cls, matte: np.ndarray, color: np.ndarray) -> Layers:
         """The paper's compositing: T = 1 - A and B = A W.
 
         Args:
             matte: A, [H, W] in [0, 1].
-            colour: W, [3] or [H, W, 3] in [0, 1].
+            color: W, [3] or [H, W, 3] in [0, 1].
         """
         alpha = np.repeat(matte.astype(np.float32)[..., None], 3, axis=2)
-        return cls(1 - alpha, alpha * np.asarray(colour, np.float32))
+        return cls(1 - alpha, alpha * np.asarray(color, np.float32))
 
     @classmethod
     def dimming(cls, transmittance: np.ndarray) -> Layers:

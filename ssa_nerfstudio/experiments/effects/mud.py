@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 from ssa_nerfstudio.experiments.effects.spatter import draw_spatter
 
 
@@ -15,7 +15,7 @@ from ssa_nerfstudio.experiments.effects.spatter import draw_spatter
 class Mud:
     """The paper's "Mud": `Spatter` in its mud mode, drawn once for all views. A stand-in for real mud.
 
-    Formation: I = T C + B with T = 1 - A and B = A colour: alpha compositing. A channel where the colour is black
+    Formation: I = T C + B with T = 1 - A and B = A color: alpha compositing. A channel where the color is black
     also has T = 1 - A.
 
     Raises:
@@ -24,7 +24,7 @@ class Mud:
 
     intensity: float = 0.6
     """Spatter's `intensity`: opacity of the densest mud, in (0, 1]."""
-    colour: tuple[int, int, int] = (63, 42, 20)
+    color: tuple[int, int, int] = (63, 42, 20)
     """Spatter's `color`, sRGB, 0..255. Brown; albumentations' own default, (20, 42, 63), is a blue."""
     mean: float = 0.65
     """Spatter's `mean`: of the liquid layer's normal distribution, in [0, 1]; more of it, more mud."""
@@ -37,7 +37,7 @@ class Mud:
 
     def __post_init__(self) -> None:
         require(self, intensity="(0, 1]", mean="[0, 1]", deviation="[0, 1]", blur="[0.5, 50]", threshold="[0, 1]")
-        require_colours(self, "colour")
+        require_colors(self, "color")
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
         """The mud at one frame size.
@@ -52,7 +52,7 @@ class Mud:
             height,
             width,
             rng,
-            colour=self.colour,
+            color=self.color,
             intensity=self.intensity,
             mean=self.mean,
             deviation=self.deviation,

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ssa_nerfstudio.experiments.effects.layers import Layers, VaryingLayers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 
 _LARGEST_SWAY = 3
 """Drift is drawn from a normal distribution cut off at so many standard deviations."""
@@ -21,7 +21,7 @@ class Occlusion:
     """A stand-in for the paper's real "Occlusion" captures: a mounting arm with a clamp, reaching in from a corner.
 
     Formation in view i: I = T_i C + B_i with T_i = 1 - A_i and B_i = A_i W_i. A_i is one matte, shifted by a few
-    pixels; W_i is the arm's colour with highlights whose place, brightness and tint are the view's own.
+    pixels; W_i is the arm's color with highlights whose place, brightness and tint are the view's own.
 
     Raises:
         ValueError: a field is out of its range.
@@ -35,7 +35,7 @@ class Occlusion:
     """Thickness of the arm as a fraction of the frame's shorter side, in (0, 0.5]."""
     blur: float = 0.012
     """Width of the defocused edge as a fraction of the frame's shorter side, in (0, 0.5]."""
-    colour: tuple[int, int, int] = (42, 44, 48)
+    color: tuple[int, int, int] = (42, 44, 48)
     """The arm where it reflects nothing, sRGB, 0..255."""
     drift: float = 2.0
     """Standard deviation of the sway along each axis, from view to view, raw pixels, in [0, 50]."""
@@ -54,7 +54,7 @@ class Occlusion:
             drift="[0, 50]",
             reflection="[0, 1]",
         )
-        require_colours(self, "colour")
+        require_colors(self, "color")
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> VaryingLayers:
         """The arm at one frame size.
@@ -86,14 +86,14 @@ class Occlusion:
             distance = np.minimum(np.maximum(np.abs(v) - 1, u), np.hypot(u, v) - _JOINT_RADIUS)
             matte = np.clip(0.5 - distance * (half / edge), 0, 1)
             covered = matte > 0
-            colour = np.zeros((*matte.shape, 3), np.float32)
-            colour[covered] = self._shade(u[covered], v[covered], rng)
-            return Layers.composited(matte, colour)
+            color = np.zeros((*matte.shape, 3), np.float32)
+            color[covered] = self._shade(u[covered], v[covered], rng)
+            return Layers.composited(matte, color)
 
         return VaryingLayers(box, view)
 
     def _shade(self, u: np.ndarray, v: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """The arm's colour [N, 3] in [0, 1] at places along and across it [N], in the light of one view."""
+        """The arm's color [N, 3] in [0, 1] at places along and across it [N], in the light of one view."""
         place, strength = rng.uniform(-0.55, 0.55), self.reflection * rng.uniform(0.3, 1)
         tint = 1 + 0.2 * rng.uniform(-1, 1, 3)
         radius = np.hypot(u, v)
@@ -104,5 +104,5 @@ class Occlusion:
         outline = np.clip(np.where(on_joint, radius / _JOINT_RADIUS, np.abs(v)), 0, 1)
         dimming = 1 - 0.5 * outline**4
         dimming -= 0.35 * (~on_joint & (np.abs(u % 3.2 - 1.6) < 0.12)) + 0.5 * (np.abs(radius - 1.15) < 0.1)
-        colour = np.array(self.colour) / 255 + highlight[:, None] * tint
-        return np.clip(colour * np.clip(dimming, 0.2, 1)[:, None], 0, 1)
+        color = np.array(self.color) / 255 + highlight[:, None] * tint
+        return np.clip(color * np.clip(dimming, 0.2, 1)[:, None], 0, 1)

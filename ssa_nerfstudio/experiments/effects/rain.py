@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 from ssa_nerfstudio.experiments.effects.spatter import draw_spatter
 
 
@@ -15,7 +15,7 @@ from ssa_nerfstudio.experiments.effects.spatter import draw_spatter
 class Rain:
     """The paper's "Rain spots": `Spatter` in its rain mode, drawn once for all views. A stand-in for real drops.
 
-    Formation: I = clip(C + B), T = 1, B = drops times colour. Real drops refract the scene; these only brighten it.
+    Formation: I = clip(C + B), T = 1, B = drops times color. Real drops refract the scene; these only brighten it.
 
     Raises:
         ValueError: a field is out of its range.
@@ -23,7 +23,7 @@ class Rain:
 
     intensity: float = 0.6
     """Spatter's `intensity`, in (0, 1]: the brightest drop adds 0.9 of it."""
-    colour: tuple[int, int, int] = (238, 238, 175)
+    color: tuple[int, int, int] = (238, 238, 175)
     """Spatter's `color`: of the added light, sRGB, 0..255; its own default, a pale yellow."""
     mean: float = 0.65
     """Spatter's `mean`: of the liquid layer's normal distribution, in [0, 1]; more of it, more drops."""
@@ -36,7 +36,7 @@ class Rain:
 
     def __post_init__(self) -> None:
         require(self, intensity="(0, 1]", mean="[0, 1]", deviation="[0, 1]", blur="[0.5, 50]", threshold="[0, 1]")
-        require_colours(self, "colour")
+        require_colors(self, "color")
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
         """The drops at one frame size.
@@ -51,7 +51,7 @@ class Rain:
             height,
             width,
             rng,
-            colour=self.colour,
+            color=self.color,
             intensity=self.intensity,
             mean=self.mean,
             deviation=self.deviation,

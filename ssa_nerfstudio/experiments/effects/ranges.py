@@ -22,13 +22,13 @@ def require(owner: object, **intervals: str) -> None:
             raise ValueError(f"{type(owner).__name__}.{name} must be in {interval}, got {value}")
 
 
-def require_colours(owner: object, *names: str) -> None:
-    """Checks that fields are sRGB colours: three numbers in 0..255.
+def require_colors(owner: object, *names: str) -> None:
+    """Checks that fields are sRGB colors: three numbers in 0..255.
 
     Raises:
         ValueError: one is not.
     """
     for name in names:
-        colour = getattr(owner, name)
-        if len(colour) != 3 or not all(0 <= channel <= 255 for channel in colour):
-            raise ValueError(f"{type(owner).__name__}.{name} must be three numbers in 0..255, got {colour}")
+        color = getattr(owner, name)
+        if len(color) != 3 or not all(0 <= channel <= 255 for channel in color):
+            raise ValueError(f"{type(owner).__name__}.{name} must be three numbers in 0..255, got {color}")

@@ -18,7 +18,7 @@ def draw_spatter(
     width: int,
     rng: np.random.Generator,
     *,
-    colour: tuple[int, int, int],
+    color: tuple[int, int, int],
     intensity: float,
     mean: float,
     deviation: float,
@@ -31,7 +31,7 @@ def draw_spatter(
         mode: which of Spatter's two formations.
         height, width: the frame, pixels.
         rng: seeds the transform.
-        colour: sRGB, 0..255.
+        color: sRGB, 0..255.
         intensity, mean, deviation, blur, threshold: Spatter's `intensity`, `mean`, `std`, `gauss_sigma` (pixels) and
             `cutout_threshold`.
 
@@ -40,7 +40,7 @@ def draw_spatter(
     """
     transform = _spatter()(
         mode=mode,
-        color=colour,
+        color=color,
         intensity=(intensity, intensity),
         mean=(mean, mean),
         std=(deviation, deviation),

@@ -9,11 +9,11 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 
 _FINE = 4
 """Oversampling in frames of up to a megapixel, half of it in larger ones."""
-Colour = tuple[int, int, int]
+Color = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -31,18 +31,18 @@ class UI:
     """Size of all elements, in [0.2, 1]; at 1 a button's side is 0.1 of the frame's height or 1 / 13 of its width."""
     panel_alpha: float = 0.65
     """Opacity of panels and empty buttons, in (0, 1]."""
-    panel_colour: Colour = (18, 22, 30)
+    panel_color: Color = (18, 22, 30)
     """Panels, sRGB, 0..255."""
-    accent_colour: Colour = (255, 186, 52)
+    accent_color: Color = (255, 186, 52)
     """Icons, frames and the marker of the minimap, sRGB, 0..255."""
-    text_colour: Colour = (240, 244, 248)
+    text_color: Color = (240, 244, 248)
     """Text, sRGB, 0..255."""
     title: str = "LEVEL 07"
     """The line at the upper edge; may be empty."""
 
     def __post_init__(self) -> None:
         require(self, scale="[0.2, 1]", panel_alpha="(0, 1]")
-        require_colours(self, "panel_colour", "accent_colour", "text_colour")
+        require_colors(self, "panel_color", "accent_color", "text_color")
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
         """The interface at one frame size.
@@ -74,26 +74,26 @@ class _Painter:
         # The lower edge holds 13 units side by side.
         self._unit = style.scale * min(height / 10, width / 13)
         self._right, self._bottom = width / self._unit, height / self._unit
-        self._panel = (*style.panel_colour, round(255 * style.panel_alpha))
-        self._accent, self._text_colour = (*style.accent_colour, 255), (*style.text_colour, 255)
+        self._panel = (*style.panel_color, round(255 * style.panel_alpha))
+        self._accent, self._text_color = (*style.accent_color, 255), (*style.text_color, 255)
 
     def status(self, levels: np.ndarray) -> None:
         """Upper left: a portrait and three bars, filled to `levels` [3] in [0, 1]."""
         self._box(0.25, 0.25, 4.6, 1.75, self._panel)
         self._circle(1.0, 1.0, 0.62, self._accent)
         self._circle(1.0, 1.0, 0.54, (52, 60, 74, 255))
-        self._circle(1.0, 0.85, 0.2, self._text_colour)
-        self._draw.pieslice(self._scaled(0.64, 1.08, 1.36, 1.8), 180, 360, fill=self._text_colour)
-        colours = ((208, 52, 48, 255), (56, 132, 220, 255), (92, 184, 84, 255))
-        for row, (level, colour) in enumerate(zip(levels, colours, strict=True)):
+        self._circle(1.0, 0.85, 0.2, self._text_color)
+        self._draw.pieslice(self._scaled(0.64, 1.08, 1.36, 1.8), 180, 360, fill=self._text_color)
+        colors = ((208, 52, 48, 255), (56, 132, 220, 255), (92, 184, 84, 255))
+        for row, (level, color) in enumerate(zip(levels, colors, strict=True)):
             top = 0.5 + 0.38 * row
             self._box(1.8, top, 4.4, top + 0.26, (10, 12, 16, 255), 0.08)
-            self._box(1.84, top + 0.04, 1.84 + 2.52 * level, top + 0.22, colour, 0.06)
+            self._box(1.84, top + 0.04, 1.84 + 2.52 * level, top + 0.22, color, 0.06)
 
     def title(self, title: str, score: int) -> None:
         """Top: a line of text and a score beneath it."""
         middle = self._right / 2
-        self._text(middle, 0.6, 0.5, title, self._text_colour)
+        self._text(middle, 0.6, 0.5, title, self._text_color)
         self._text(middle, 1.15, 0.34, f"{score:07d}", self._accent)
 
     def minimap(self, rng: np.random.Generator) -> None:
@@ -118,25 +118,25 @@ class _Painter:
             self._box(x - 0.06, top - 0.06, x + 1.06, top + 1.06, frame, 0.18)
             self._box(x, top, x + 1, top + 1, self._panel, 0.14)
             self._icon(number, x + 0.5, top + 0.5)
-            self._text(x + 0.17, top + 0.2, 0.24, str(number + 1), self._text_colour)
+            self._text(x + 0.17, top + 0.2, 0.24, str(number + 1), self._text_color)
 
     def menu(self) -> None:
         """Lower left: a recording mark and its time. Lower right: two round buttons."""
         self._box(0.25, self._bottom - 0.95, 2.95, self._bottom - 0.35, self._panel)
         self._circle(0.6, self._bottom - 0.65, 0.14, (228, 44, 40, 255))
-        self._text(1.85, self._bottom - 0.65, 0.34, "REC 12:47", self._text_colour)
+        self._text(1.85, self._bottom - 0.65, 0.34, "REC 12:47", self._text_color)
         buttons = ((0.85, 2.0, "A", (60, 160, 84, 255)), (2.0, 0.9, "B", (196, 60, 52, 255)))
-        for from_right, from_bottom, letter, colour in buttons:
+        for from_right, from_bottom, letter, color in buttons:
             x, y = self._right - from_right, self._bottom - from_bottom
-            self._circle(x, y, 0.55, self._text_colour)
-            self._circle(x, y, 0.48, colour)
-            self._text(x, y, 0.55, letter, self._text_colour)
+            self._circle(x, y, 0.55, self._text_color)
+            self._circle(x, y, 0.48, color)
+            self._text(x, y, 0.55, letter, self._text_color)
 
     def _icon(self, kind: int, x: float, y: float) -> None:
         """One of five pictograms about a point: sword, flask, lightning, shield, plus."""
         if kind == 1:
             self._circle(x, y + 0.1, 0.22, (96, 176, 232, 255))
-            self._box(x - 0.07, y - 0.3, x + 0.07, y - 0.05, self._text_colour, 0.02)
+            self._box(x - 0.07, y - 0.3, x + 0.07, y - 0.05, self._text_color, 0.02)
             return
         outlines = {
             0: [(-0.28, 0.22), (0.2, -0.3), (0.28, -0.28), (0.26, -0.2), (-0.22, 0.28)],

@@ -12,7 +12,7 @@ from ssa_nerfstudio.experiments.effects.ranges import require
 
 @dataclass(frozen=True)
 class Vignette:
-    """A radial falloff about the frame's centre, the same for all channels.
+    """A radial falloff about the frame's center, the same for all channels.
 
     Formation: I = T C with T = 1 - strength s^2 (3 - 2 s), s rising from 0 at `start` to 1 in the corners; B = 0.
 
@@ -23,7 +23,7 @@ class Vignette:
     strength: float = 0.75
     """Share of the light lost in the corners, in (0, 1]."""
     start: float = 0.25
-    """Radius at which the falloff starts, as a fraction of the way from centre to corner, in [0, 1)."""
+    """Radius at which the falloff starts, as a fraction of the way from center to corner, in [0, 1)."""
 
     def __post_init__(self) -> None:
         require(self, strength="(0, 1]", start="[0, 1)")

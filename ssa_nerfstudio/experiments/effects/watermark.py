@@ -1,4 +1,4 @@
-"""A semi-transparent watermark: a camera logo at the frame's centre and a line of text beneath it."""
+"""A semi-transparent watermark: a camera logo at the frame's center and a line of text beneath it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colours
+from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
 
 _OVERSAMPLING = 4
 
@@ -25,14 +25,14 @@ class Watermark:
     """Opacity of the mark, in (0, 1]; the paper uses 0.4."""
     size: float = 0.62
     """Width of the text line as a fraction of the frame's width, in (0, 1]; smaller where a flat frame needs it."""
-    colour: tuple[int, int, int] = (255, 255, 255)
-    """Colour of the mark, sRGB, 0..255."""
+    color: tuple[int, int, int] = (255, 255, 255)
+    """Color of the mark, sRGB, 0..255."""
     text: str = "SAMPLE STOCK"
     """The line beneath the logo; not empty."""
 
     def __post_init__(self) -> None:
         require(self, alpha="(0, 1]", size="(0, 1]")
-        require_colours(self, "colour")
+        require_colors(self, "color")
         if not self.text.strip():
             raise ValueError(f"Watermark.text must not be empty, got {self.text!r}")
 
@@ -45,24 +45,24 @@ class Watermark:
             rng: not drawn from; a watermark has no chance in it.
 
         Returns:
-            T = 1 - A and B = A colour, with A = alpha times the mark's coverage of the pixel.
+            T = 1 - A and B = A color, with A = alpha times the mark's coverage of the pixel.
         """
-        return Layers.composited(self.alpha * self._coverage(height, width), np.array(self.colour) / 255)
+        return Layers.composited(self.alpha * self._coverage(height, width), np.array(self.color) / 255)
 
     def _coverage(self, height: int, width: int) -> np.ndarray:
         """Share of each pixel under the mark, [height, width] in [0, 1]."""
         canvas = Image.new("L", (width * _OVERSAMPLING, height * _OVERSAMPLING))
         draw = ImageDraw.Draw(canvas)
-        centre_x, centre_y = canvas.width / 2, canvas.height / 2
-        # Logo and text together are 0.8 of the text's width high, measured about the centre.
+        center_x, center_y = canvas.width / 2, canvas.height / 2
+        # Logo and text together are 0.8 of the text's width high, measured about the center.
         extent = min(self.size * canvas.width, 1.2 * canvas.height)
 
         def box(half_width: float, top: float, bottom: float) -> tuple[float, float, float, float]:
             return (
-                centre_x - half_width * extent,
-                centre_y + top * extent,
-                centre_x + half_width * extent,
-                centre_y + bottom * extent,
+                center_x - half_width * extent,
+                center_y + top * extent,
+                center_x + half_width * extent,
+                center_y + bottom * extent,
             )
 
         draw.rounded_rectangle(box(0.1, -0.215, -0.1), radius=0.03 * extent, fill=255)
@@ -72,5 +72,5 @@ class Watermark:
 
         reference = ImageFont.load_default(100).getlength(self.text)
         font = ImageFont.load_default(max(1.0, 100 * extent / reference))
-        draw.text((centre_x, centre_y + 0.28 * extent), self.text, fill=255, font=font, anchor="mm")
+        draw.text((center_x, center_y + 0.28 * extent), self.text, fill=255, font=font, anchor="mm")
         return np.asarray(canvas.reduce(_OVERSAMPLING), dtype=np.float64) / 255

@@ -50,7 +50,7 @@ class Outcome:
     """What one training gave and cost."""
 
     metrics: dict[str, float]
-    """Means over the test views: psnr (dB), ssim, flip, mean_colour_deviation, composite_psnr, ..."""
+    """Means over the test views: psnr (dB), ssim, flip, mean_color_deviation, composite_psnr, ..."""
     seconds: dict[str, float]
     """startup (photos, model), statistics (of the photos, for the overlay), training, evaluation."""
     gaussians: int
@@ -319,7 +319,7 @@ def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
 
 @dataclass
 class Command:
-    """One training, its figures written as JSON: `python -m ssa_nerfstudio.experiments.runs.training_run --data DIR --output FILE`."""
+    """Train once and write the metrics as JSON: `python -m ssa_nerfstudio.experiments.runs.training_run`."""
 
     data: Path
     """A nerfstudio dataset."""

@@ -25,7 +25,7 @@ _CUBOIDS = (
     ((-0.95, 1.00, 0.25), (0.50, 0.35, 0.25), 0, 0, (20, 88, 140), (250, 226, 96)),
     ((0.05, -1.20, 0.20), (0.30, 0.22, 0.20), 60, 0, (126, 70, 28), (160, 214, 226)),
 )
-"""Centre and half sizes (scene units, z up, floor at 0), yaw and roll (degrees), dark and light texture colour (sRGB).
+"""Center and half sizes (scene units, z up, floor at 0), yaw and roll (degrees), dark and light texture color (sRGB).
 
 The first is the room, seen from inside; the others are the boxes in it.
 """
@@ -40,18 +40,18 @@ _SPARSE_NOISE = 0.005
 class _Face(NamedTuple):
     """A textured rectangle, seen from the side its normal points to."""
 
-    centre: np.ndarray
+    center: np.ndarray
     axes: np.ndarray
     """u, v and the normal as rows, [3, 3]."""
     half: tuple[float, float]
     texture: np.ndarray
-    """Display colours, float32 [rows along v, columns along u, 3]."""
+    """Display colors, float32 [rows along v, columns along u, 3]."""
 
 
 class _Cuboid(NamedTuple):
     """The room or a box, with the radius of the sphere around it."""
 
-    centre: np.ndarray
+    center: np.ndarray
     radius: float
     faces: list[_Face]
 
@@ -88,7 +88,7 @@ class DemoScene:
 
     @property
     def focal_length(self) -> float:
-        """Focal length in pixels along both axes; the principal point is the image's centre."""
+        """Focal length in pixels along both axes; the principal point is the image's center."""
         return float(self.width / 2 / np.tan(np.radians(self.fov_x) / 2))
 
     @cached_property
@@ -100,7 +100,7 @@ class DemoScene:
         """
         count = self.views + self.test_views
         index = np.arange(count)
-        # Irrational steps spread every quantity evenly over its range in any run of neighbouring views.
+        # Irrational steps spread every quantity evenly over its range in any run of neighboring views.
         start = np.random.default_rng([self.seed, 1]).uniform(size=5)
         spread = (start + index[:, None] * (np.sqrt([2, 3, 5, 7, 11]) % 1)) % 1
         lowest, highest = np.array([3.1, 0.6, -0.8, -0.8, -1.4]), np.array([3.9, 3.0, 0.8, 0.8, 1.5])
@@ -131,19 +131,19 @@ class DemoScene:
             directions: [N, 3], of any length.
 
         Returns:
-            Distance in multiples of `directions` [N] and display colour [N, 3] in [0, 1], both float32.
+            Distance in multiples of `directions` [N] and display color [N, 3] in [0, 1], both float32.
         """
         rays = np.ascontiguousarray(directions.T, dtype=np.float32)
         depth = np.full(rays.shape[1], np.inf, dtype=np.float32)
-        colour = np.zeros((rays.shape[1], 3), dtype=np.float32)
+        color = np.zeros((rays.shape[1], 3), dtype=np.float32)
         lengths = np.square(rays).sum(axis=0)
         for cuboid in self._cuboids:
-            offset = (cuboid.centre - origin).astype(np.float32)
-            # The square of a ray's way past the bounding sphere's centre tells whether it meets the sphere.
+            offset = (cuboid.center - origin).astype(np.float32)
+            # The square of a ray's way past the bounding sphere's center tells whether it meets the sphere.
             near = np.flatnonzero(np.square(offset @ rays) >= (offset @ offset - cuboid.radius**2) * lengths)
             bundle = rays.take(near, axis=1)
             for face in cuboid.faces:
-                u0, v0, n0 = (face.axes @ (origin - face.centre)).astype(np.float32)
+                u0, v0, n0 = (face.axes @ (origin - face.center)).astype(np.float32)
                 if n0 <= 0:
                     continue
                 du, dv, dn = face.axes.astype(np.float32) @ bundle
@@ -157,8 +157,8 @@ class DemoScene:
                 rows, columns, _ = face.texture.shape
                 row = ((v[hits] + face.half[1]) * _TEXELS).astype(int).clip(0, rows - 1)
                 column = ((u[hits] + face.half[0]) * _TEXELS).astype(int).clip(0, columns - 1)
-                colour[near[hits]] = face.texture[row, column]
-        return depth, colour
+                color[near[hits]] = face.texture[row, column]
+        return depth, color
 
     def render(self, camera_to_world: np.ndarray) -> np.ndarray:
         """One camera's clean photo, uint8 [height, width, 3]: 3 x 3 rays a pixel, box-filtered.
@@ -169,26 +169,26 @@ class DemoScene:
         steps = _SUPERSAMPLING
         x, y = ((np.arange(side * steps) + 0.5) / steps for side in (self.width, self.height))
         pixels = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-        _, colour = self.trace(camera_to_world[:3, 3], self.rays(camera_to_world, pixels))
-        colour = colour.reshape(self.height, steps, self.width, steps, 3).mean(axis=1).mean(axis=2)
-        return np.rint(colour * 255).astype(np.uint8)
+        _, color = self.trace(camera_to_world[:3, 3], self.rays(camera_to_world, pixels))
+        color = color.reshape(self.height, steps, self.width, steps, 3).mean(axis=1).mean(axis=2)
+        return np.rint(color * 255).astype(np.uint8)
 
     def sparse_points(self) -> tuple[np.ndarray, np.ndarray]:
         """What structure from motion would find: noisy points on surfaces that training cameras see.
 
         Returns:
-            Positions [4000, 3] (standard deviation 0.005 scene units) and display colours uint8 [4000, 3].
+            Positions [4000, 3] (standard deviation 0.005 scene units) and display colors uint8 [4000, 3].
         """
         rng = np.random.default_rng([self.seed, 2])
         train, _ = self.cameras
-        points, colours = [], []
+        points, colors = [], []
         for pose, share in zip(train, np.array_split(np.arange(_SPARSE_POINTS), len(train)), strict=True):
             directions = self.rays(pose, rng.uniform(size=(len(share), 2)) * [self.width, self.height])
-            depth, colour = self.trace(pose[:3, 3], directions)
+            depth, color = self.trace(pose[:3, 3], directions)
             points.append(pose[:3, 3] + depth[:, None] * directions)
-            colours.append(np.rint(colour * 255).astype(np.uint8))
+            colors.append(np.rint(color * 255).astype(np.uint8))
         noise = rng.normal(scale=_SPARSE_NOISE, size=(_SPARSE_POINTS, 3))
-        return np.concatenate(points) + noise, np.concatenate(colours)
+        return np.concatenate(points) + noise, np.concatenate(colors)
 
     def write(self, output: Path, artifact: Layers | None) -> None:
         """Writes the capture as a nerfstudio dataset: images/, transforms.json and sparse_pc.ply.
@@ -249,11 +249,11 @@ class DemoScene:
 
 def _cuboid(
     number: int,
-    centre: tuple[float, ...],
+    center: tuple[float, ...],
     halves: tuple[float, ...],
     yaw: float,
     roll: float,
-    *colours: tuple[int, ...],
+    *colors: tuple[int, ...],
     rng: np.random.Generator,
 ) -> _Cuboid:
     """One row of the table, each face with its own texture and baked light."""
@@ -265,18 +265,18 @@ def _cuboid(
         u, v = (other for other in range(3) if other != axis)
         normal = rotation[:, axis] * (-sign if number == 0 else sign)
         half = (halves[u], halves[v])
-        texture = _texture((number + side) % 6, half, np.array(colours) / 255, rng) * (0.7 + 0.4 * normal @ _LIGHT)
-        middle = np.array(centre) + sign * halves[axis] * rotation[:, axis]
+        texture = _texture((number + side) % 6, half, np.array(colors) / 255, rng) * (0.7 + 0.4 * normal @ _LIGHT)
+        middle = np.array(center) + sign * halves[axis] * rotation[:, axis]
         axes = np.stack([rotation[:, u], rotation[:, v], normal])
         faces.append(_Face(middle, axes, half, texture.clip(0, 1).astype(np.float32)))
-    return _Cuboid(np.array(centre), float(np.linalg.norm(halves)), faces)
+    return _Cuboid(np.array(center), float(np.linalg.norm(halves)), faces)
 
 
-def _texture(kind: int, half: tuple[float, float], colours: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """One of six patterns between a dark and a light colour, under several octaves of value noise.
+def _texture(kind: int, half: tuple[float, float], colors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """One of six patterns between a dark and a light color, under several octaves of value noise.
 
     Returns:
-        Colours [rows along v, columns along u, 3], about [0, 1].
+        Colors [rows along v, columns along u, 3], about [0, 1].
     """
     width, height = (round(2 * side * _TEXELS) for side in half)
     period = 0.3 * np.sqrt(max(half)) * rng.uniform(0.8, 1.2)
@@ -304,13 +304,13 @@ def _texture(kind: int, half: tuple[float, float], colours: np.ndarray, rng: np.
         mask = np.sin(9 * noise) > 0
     tone = rng.uniform(-0.25, 0.25, (64, 64)).astype(np.float32)[row.astype(int) % 64, np.floor(x).astype(int) % 64]
     blend = np.clip(np.where(mask, 0.8, 0.1) + tone + 0.24 * noise, 0, 1)[..., None]
-    return ((1 - blend) * colours[0] + blend * colours[1]) * rng.uniform(0.94, 1.06, 3)
+    return ((1 - blend) * colors[0] + blend * colors[1]) * rng.uniform(0.94, 1.06, 3)
 
 
-def _write_ply(path: Path, points: np.ndarray, colours: np.ndarray) -> None:
-    """An ASCII point cloud from positions [N, 3] and colours uint8 [N, 3]."""
+def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
+    """An ASCII point cloud from positions [N, 3] and colors uint8 [N, 3]."""
     properties = [f"property float {axis}" for axis in "xyz"]
     properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
     header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]
-    rows = np.hstack([points, colours])
+    rows = np.hstack([points, colors])
     np.savetxt(path, rows, fmt="%.5f %.5f %.5f %d %d %d", header="\n".join(header), comments="")

@@ -20,7 +20,7 @@ from ssa_nerfstudio.plugin.training.nonfinite import bury_broken
 
 @dataclass
 class AdaptiveDensityControl(DefaultStrategy):
-    """gsplat's DefaultStrategy (3DGS, Kerbl et al. 2023), with statistics that need no host synchronisation.
+    """gsplat's DefaultStrategy (3DGS, Kerbl et al. 2023), with statistics that need no host synchronization.
 
     gsplat 1.4.0 resets opacities at step 0 too (`step % reset_every == 0`). Here that reset is left out: it exists to
     expose floaters, of which there are none before the first step, and the original implementation has none either.
@@ -95,7 +95,7 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     """
 
     absgrad: bool = False
-    """MCMC reads no gradients of the centres; a field because the render call asks for it."""
+    """MCMC reads no gradients of the centers; a field because the render call asks for it."""
     guarded: bool = True
     """Relocate Gaussians that are not finite, and go on where nobody is alive; skipped steps perturb nothing."""
 

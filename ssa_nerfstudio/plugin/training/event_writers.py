@@ -20,7 +20,7 @@ class SparingWriter:
     """An event writer of nerfstudio's that gets every number at those steps only at which losses are logged.
 
     nerfstudio 1.1.5 writes times, rates and learning rates at every step (engine/trainer.py:309), which costs half a
-    millisecond with tensorboard: more than the optimisers. Times and rates are means over the last steps anyway.
+    millisecond with tensorboard: more than the optimizers. Times and rates are means over the last steps anyway.
     """
 
     def __init__(self, inner: Any, every: int) -> None:

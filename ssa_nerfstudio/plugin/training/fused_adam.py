@@ -23,7 +23,7 @@ class FusedAdamConfig(AdamOptimizerConfig):
 class FusedAdam(torch.optim.Adam):
     """`torch.optim.Adam(fused=True)`, whose state it keeps to the letter.
 
-    A training of splats has seven optimisers of one or two parameters, and is bound by the host: what torch does around
+    A training of splats has seven optimizers of one or two parameters, and is bound by the host: what torch does around
     the kernel (sorting by device and type, a dictionary of found_inf a call, undoing the step count of a refused step
     with one more kernel) costs several times the kernel.
     """

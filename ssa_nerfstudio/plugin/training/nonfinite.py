@@ -78,7 +78,7 @@ class StepGuard:
         return torch.add(self._seed, self._loss, alpha=0)
 
     def judge(self, optimizers: Mapping[str, torch.optim.Optimizer]) -> Tensor:
-        """Decide about the step whose gradients the optimisers' parameters hold; no waiting for the device.
+        """Decide about the step whose gradients the optimizers' parameters hold; no waiting for the device.
 
         Args:
             optimizers: all of them by name, whether they step now or gather gradients for later. Gradients become
@@ -87,7 +87,7 @@ class StepGuard:
         Returns:
             What `skipped` is from now on.
         """
-        # Not from a list of old: densification puts new parameters into the optimisers.
+        # Not from a list of old: densification puts new parameters into the optimizers.
         parameters = [p for o in optimizers.values() for group in o.param_groups for p in group["params"]]
         if self._judged == 0:
             self._skips = parameters[0].new_zeros(READ_EVERY, dtype=torch.float32)
@@ -109,13 +109,13 @@ class StepGuard:
         return skipped
 
     def watch(self, optimizer: torch.optim.Optimizer) -> None:
-        """Let an optimiser take no step that was judged to be skipped."""
+        """Let an optimizer take no step that was judged to be skipped."""
         if not isinstance(optimizer, FusedAdam):
             optimizer.register_step_pre_hook(self._before_step)
             optimizer.register_step_post_hook(_forget)
 
     def _before_step(self, optimizer: torch.optim.Optimizer, *_: Any) -> None:
-        """torch's fused optimisers are told on the device, for others the host has to ask."""
+        """torch's fused optimizers are told on the device, for others the host has to ask."""
         if self.skipped is None:
             return
         if getattr(optimizer, "_step_supports_amp_scaling", False):
@@ -168,7 +168,7 @@ class StepGuard:
 
         Args:
             still_there: the last step was skipped, and its loss and gradients can be looked at; those of earlier ones
-                are gone, as are gradients that optimisers were kept from, or of parameters that a refinement replaced.
+                are gone, as are gradients that optimizers were kept from, or of parameters that a refinement replaced.
         """
         parameters = list(_parameters(self._optimizers))
         values = [name for name, p in parameters if not torch.isfinite(p).all()]
@@ -218,7 +218,7 @@ def _forget(optimizer: torch.optim.Optimizer, *_: Any) -> None:
 
 
 def _parameters(optimizers: Mapping[str, torch.optim.Optimizer]) -> Iterator[tuple[str, Tensor]]:
-    """Every parameter with its name, in the order of the optimisers."""
+    """Every parameter with its name, in the order of the optimizers."""
     for name, optimizer in optimizers.items():
         parameters = [p for group in optimizer.param_groups for p in group["params"]]
         for number, parameter in enumerate(parameters):
@@ -244,7 +244,7 @@ def bury_broken(params: ParameterDict | dict[str, Parameter]) -> Tensor:
 
 
 def usable_points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor] | None:
-    """Start points [N, 3] and colours [N or 0, 3] without those that are not finite; None where none is left."""
+    """Start points [N, 3] and colors [N or 0, 3] without those that are not finite; None where none is left."""
     if points is None:
         return None
     finite = torch.isfinite(points[0]).all(dim=1)
@@ -255,7 +255,7 @@ def usable_points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]
 
 
 def give_sizes_to_points_without(log_scales: Tensor) -> None:
-    """Give start points that have no distance to their neighbours (they lie on one another) the usual size, in place.
+    """Give start points that have no distance to their neighbors (they lie on one another) the usual size, in place.
 
     Args:
         log_scales: [N, 3], -inf or NaN where a point has no size.

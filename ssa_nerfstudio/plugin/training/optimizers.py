@@ -1,4 +1,4 @@
-"""All optimisers of a training at once: their steps counted in one kernel, and taken all together or not at all."""
+"""All optimizers of a training at once: their steps counted in one kernel, and taken all together or not at all."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ssa_nerfstudio.plugin.training.nonfinite import StepGuard
 
 
 class JointOptimizers(Optimizers):
-    """nerfstudio's optimisers, with a guard that judges every step or none."""
+    """nerfstudio's optimizers, with a guard that judges every step or none."""
 
     def __init__(
         self,

@@ -30,14 +30,13 @@ def result(run: Run, **changes) -> Result:
     """A finished run: 20 dB and GAIN, 1 dB more under MCMC, 0.1 dB a seed, views 1 dB apart around that."""
     psnr = 20.0 + GAIN.get(run.method, -2.0) + (run.densification == "mcmc") + 0.1 * run.seed
     views = {
-        f"view_{k}.png": {"psnr": psnr + k - 1, "ssim": 0.8, "flip": 0.2, "mean_colour_deviation": 5.0}
-        for k in range(3)
+        f"view_{k}.png": {"psnr": psnr + k - 1, "ssim": 0.8, "flip": 0.2, "mean_color_deviation": 5.0} for k in range(3)
     }
     return dataclasses.replace(
         Result(
             run,
             "finished",
-            metrics={"psnr": psnr, "ssim": 0.8, "flip": 0.2, "mean_colour_deviation": 5.0},
+            metrics={"psnr": psnr, "ssim": 0.8, "flip": 0.2, "mean_color_deviation": 5.0},
             views=views,
             seconds={"startup": 5.0, "statistics": 1.0, "training": run.steps / 100, "evaluation": 2.0},
             alone=True,

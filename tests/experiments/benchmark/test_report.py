@@ -103,7 +103,7 @@ def test_ablation_and_sensitivity_are_the_papers_tables():
     drawn = tables.ablation(study, with_paper=False)
     assert drawn is not None
     assert column(drawn, "L_sparse + const. init", "PSNR ↑") == "19.05 / 20.05"
-    assert column(drawn, "No regularization", "colour deviation ↓") == "5.00 / 5.00"
+    assert column(drawn, "No regularization", "color deviation ↓") == "5.00 / 5.00"
     weights = tables.sensitivity(study, with_paper=False)
     assert weights is not None
     assert weights.rows[-1][:2] == ["Mean, the paper's rule", "20.05 / 21.05"]

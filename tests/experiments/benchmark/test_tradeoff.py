@@ -11,7 +11,7 @@ from made_results import benchmark, folder_of, result
 from PIL import Image
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyse
+from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyze
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Tradeoff
 from ssa_nerfstudio.experiments.benchmark.specification.plan import plan_tradeoff
@@ -56,7 +56,7 @@ def points(folder) -> list[dict[str, str]]:
 
 
 def test_every_point_is_written_with_its_command_and_the_frontier_marked(tmp_path):
-    files, problems = analyse([folder_of(tmp_path, curves())], tmp_path / "out", IDS)
+    files, problems = analyze([folder_of(tmp_path, curves())], tmp_path / "out", IDS)
     assert problems == []
     rows = points(tmp_path / "out")
     assert len(rows) == 4 * 3
@@ -75,7 +75,7 @@ def test_every_point_is_written_with_its_command_and_the_frontier_marked(tmp_pat
 def test_a_run_that_shared_its_device_is_on_no_frontier(tmp_path):
     made = curves()
     alone = [dataclasses.replace(r, alone=r.run.variation != {}) for r in made]
-    _, problems = analyse([folder_of(tmp_path, alone)], tmp_path / "out", IDS)
+    _, problems = analyze([folder_of(tmp_path, alone)], tmp_path / "out", IDS)
     assert len(problems) == 1
     assert made[0].run.id in problems[0]
     rows = points(tmp_path / "out")
@@ -88,7 +88,7 @@ def test_a_run_that_shared_its_device_is_on_no_frontier(tmp_path):
 
 def test_without_any_run_alone_there_are_curves_but_no_frontier(tmp_path):
     shared = [dataclasses.replace(r, alone=False) for r in curves()]
-    analyse([folder_of(tmp_path, shared)], tmp_path / "out", IDS)
+    analyze([folder_of(tmp_path, shared)], tmp_path / "out", IDS)
     assert {row["on_frontier"] for row in points(tmp_path / "out")} == {"0"}
     text = (tmp_path / "out" / "tradeoff.md").read_text()
     assert "there is no frontier" in text
@@ -98,13 +98,13 @@ def test_without_any_run_alone_there_are_curves_but_no_frontier(tmp_path):
 def test_gpu_and_cpu_are_never_on_one_frontier(tmp_path):
     made = curves()
     made[0] = dataclasses.replace(made[0], versions={**made[0].versions, "device": "NVIDIA H200"})
-    analyse([folder_of(tmp_path, made)], tmp_path / "out", IDS)
+    analyze([folder_of(tmp_path, made)], tmp_path / "out", IDS)
     assert (tmp_path / "out" / "barn-dashboard-gpu.png").exists()
     assert (tmp_path / "out" / "barn-dashboard-cpu.png").exists()
 
 
 def test_prices_and_knobs_are_those_of_the_curves(tmp_path):
-    analyse([folder_of(tmp_path, curves())], tmp_path / "out", IDS)
+    analyze([folder_of(tmp_path, curves())], tmp_path / "out", IDS)
     text = (tmp_path / "out" / "tradeoff.md").read_text()
     assert "Base: overlay_downscale default, steps 7000" in text
     # overlay_downscale 2 ends 1 dB below the base and 2 s earlier: 2 s for each dB.
@@ -115,20 +115,20 @@ def test_an_infinite_psnr_and_a_start_without_seconds_are_no_points(tmp_path):
     made = curves()
     made[0].curve[0]["psnr"] = float("inf")
     made[1].curve[0]["seconds"] = 0.0
-    analyse([folder_of(tmp_path, made)], tmp_path / "out", IDS)
+    analyze([folder_of(tmp_path, made)], tmp_path / "out", IDS)
     assert len(points(tmp_path / "out")) == 4 * 3 - 2
 
 
 def test_a_folder_without_curves_is_refused(tmp_path, capsys):
     with pytest.raises(InputError, match="no finished run of ssa tradeoff"):
-        analyse([folder_of(tmp_path, [])], tmp_path / "out", IDS)
+        analyze([folder_of(tmp_path, [])], tmp_path / "out", IDS)
     assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_missing_runs_are_named(tmp_path):
     made = curves()
-    analyse([folder_of(tmp_path, made[1:])], tmp_path / "out", IDS)
+    analyze([folder_of(tmp_path, made[1:])], tmp_path / "out", IDS)
     text = (tmp_path / "out" / "tradeoff.md").read_text()
     assert f"1 of 4 planned ones are missing: `{made[0].run.id}`." in text
-    analyse([folder_of(tmp_path, made)], tmp_path / "out", IDS)
+    analyze([folder_of(tmp_path, made)], tmp_path / "out", IDS)
     assert "0 of 4 planned ones are missing." in (tmp_path / "out" / "tradeoff.md").read_text()

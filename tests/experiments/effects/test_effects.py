@@ -106,9 +106,9 @@ def test_mud_is_composited_brown_and_albumentations_own():
     assert np.abs(layers.apply(photo).astype(int) - by_albumentations("mud", photo, (63, 42, 20))).max() <= 1
 
 
-def by_albumentations(mode, photo: np.ndarray, colour: tuple[int, int, int] | None) -> np.ndarray:
+def by_albumentations(mode, photo: np.ndarray, color: tuple[int, int, int] | None) -> np.ndarray:
     """The photo as the transform itself corrupts it, seeded as the simulator seeds it for seed 3."""
-    transform = Spatter(mode=mode, color=colour, p=1.0)
+    transform = Spatter(mode=mode, color=color, p=1.0)
     transform.set_random_seed(int(rng(3).integers(2**31)))
     return transform(image=photo)["image"].astype(int)
 
@@ -166,15 +166,15 @@ def test_occlusion_comes_from_its_corner(corner):
 
 
 def test_occlusion_sways_by_a_few_pixels():
-    def centre(view: int, drift: float) -> np.ndarray:
+    def center(view: int, drift: float) -> np.ndarray:
         matte = drawn(Occlusion(drift=drift, reach=0.4), 200, 300, view=view).matte
         matte = matte[:-60, 60:]  # the joint, without what the frame cuts off
         y, x = np.mgrid[: matte.shape[0], : matte.shape[1]]
         return np.array([(matte * y).sum(), (matte * x).sum()]) / matte.sum()
 
-    swaying = np.array([centre(view, 2.0) for view in range(16)])
+    swaying = np.array([center(view, 2.0) for view in range(16)])
     assert 0.7 < swaying.std(axis=0).mean() < 3
-    assert np.array([centre(view, 0.0) for view in range(4)]).std(axis=0).max() < 1e-6
+    assert np.array([center(view, 0.0) for view in range(4)]).std(axis=0).max() < 1e-6
 
 
 def test_what_varies_stays_in_its_box():
@@ -202,9 +202,9 @@ def test_what_varies_stays_in_its_box():
         (Finger, "reach", 0.0),
         (Finger, "blur", 0.6),
         (Finger, "variation", 0.6),
-        (Finger, "colour", (1, 2, 300)),
+        (Finger, "color", (1, 2, 300)),
         (Mud, "intensity", 0.0),
-        (Mud, "colour", (1, 2)),
+        (Mud, "color", (1, 2)),
         (Mud, "blur", 0.0),
         (Occlusion, "corner", "left"),
         (Occlusion, "drift", -1.0),
@@ -214,7 +214,7 @@ def test_what_varies_stays_in_its_box():
         (Rain, "mean", float("inf")),
         (UI, "scale", 0.1),
         (UI, "panel_alpha", 0.0),
-        (UI, "text_colour", (0, 0, -1)),
+        (UI, "text_color", (0, 0, -1)),
         (Vignette, "strength", 0.0),
         (Vignette, "start", 1.0),
     ],

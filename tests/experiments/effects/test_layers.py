@@ -122,7 +122,7 @@ def test_dashboard_height_and_softness_mean_what_they_say() -> None:
     assert partly_covered(8.0) == pytest.approx(8, abs=0.5)
 
 
-def test_watermark_has_its_alpha_at_the_centre_and_leaves_the_corners() -> None:
+def test_watermark_has_its_alpha_at_the_center_and_leaves_the_corners() -> None:
     layers = Watermark().layers(112, 160, np.random.default_rng(0))
     assert layers.transmittance[56, 80] == pytest.approx([0.6] * 3, abs=1e-7)
     assert layers.addition[56, 80] == pytest.approx([0.4] * 3, abs=1e-7)
@@ -138,8 +138,8 @@ def test_watermark_size_is_the_width_of_its_text() -> None:
     assert columns.mean() == pytest.approx(400, abs=4)
 
 
-def test_watermark_colour() -> None:
-    layers = Watermark(alpha=0.5, colour=(255, 0, 51)).layers(60, 90, np.random.default_rng(0))
+def test_watermark_color() -> None:
+    layers = Watermark(alpha=0.5, color=(255, 0, 51)).layers(60, 90, np.random.default_rng(0))
     assert layers.addition[30, 45] == pytest.approx([0.5, 0.0, 0.1], abs=1e-6)
 
 
@@ -150,11 +150,11 @@ def test_watermark_colour() -> None:
         (Dashboard, "height", 0.51),
         (Dashboard, "height", float("nan")),
         (Dashboard, "softness", 0.0),
-        (Dashboard, "panel_colour", (0, 0, 256)),
+        (Dashboard, "panel_color", (0, 0, 256)),
         (Watermark, "alpha", 0.0),
         (Watermark, "alpha", 1.1),
         (Watermark, "size", -1.0),
-        (Watermark, "colour", (1, 2)),
+        (Watermark, "color", (1, 2)),
         (Watermark, "text", "  "),
     ],
 )

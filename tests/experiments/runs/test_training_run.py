@@ -78,10 +78,10 @@ def _overlay(layers: Layers) -> ScreenSpaceOverlay:
     height, width = layers.matte.shape
     overlay = ScreenSpaceOverlay(height, width)
     alpha = torch.from_numpy(1 - layers.transmittance[..., :1])
-    colour = torch.from_numpy(layers.addition) / alpha.clamp_min(1e-3)
+    color = torch.from_numpy(layers.addition) / alpha.clamp_min(1e-3)
     with torch.no_grad():
         overlay.alpha_logits.copy_(alpha.logit(eps=1e-6))
-        overlay.color_logits.copy_(colour.logit(eps=1e-6))
+        overlay.color_logits.copy_(color.logit(eps=1e-6))
     return overlay
 
 

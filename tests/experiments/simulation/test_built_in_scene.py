@@ -1,4 +1,4 @@
-"""The ray-cast capture: geometry, colours and the files that nerfstudio reads."""
+"""The ray-cast capture: geometry, colors and the files that nerfstudio reads."""
 
 from __future__ import annotations
 
@@ -54,21 +54,21 @@ def in_frame(scene: DemoScene, pixels: np.ndarray, depth: np.ndarray, margin: fl
 
 
 def visible(scene: DemoScene, camera_to_world: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which points nothing hides from the camera [N], and the colours seen in their directions [N, 3]."""
-    reached, colours = scene.trace(camera_to_world[:3, 3], points - camera_to_world[:3, 3])
-    return reached > 0.999, colours
+    """Which points nothing hides from the camera [N], and the colors seen in their directions [N, 3]."""
+    reached, colors = scene.trace(camera_to_world[:3, 3], points - camera_to_world[:3, 3])
+    return reached > 0.999, colors
 
 
-def test_a_surface_point_has_one_colour_in_all_views(scene: DemoScene) -> None:
+def test_a_surface_point_has_one_color_in_all_views(scene: DemoScene) -> None:
     train, _ = scene.cameras
     pixels = pixel_grid(scene, 4)
     compared = 0
     for first, second in ((0, 1), (3, 7), (11, 5)):
         directions = scene.rays(train[first], pixels)
-        depth, colours = scene.trace(train[first][:3, 3], directions)
+        depth, colors = scene.trace(train[first][:3, 3], directions)
         points = train[first][:3, 3] + depth[:, None] * directions
-        seen, seen_colours = visible(scene, train[second], points)
-        difference = np.abs(seen_colours - colours)[seen].max(axis=1)
+        seen, seen_colors = visible(scene, train[second], points)
+        difference = np.abs(seen_colors - colors)[seen].max(axis=1)
         # A point on the border of two texels may fall to either side.
         assert (difference < 1e-6).mean() > 0.99
         compared += int(seen.sum())
@@ -81,8 +81,8 @@ def test_a_photo_pixel_is_the_mean_of_its_rays(scene: DemoScene) -> None:
     offsets = (np.arange(3) + 0.5) / 3
     for row, column in ((0, 0), (20, 71), (55, 79)):
         x, y = np.meshgrid(column + offsets, row + offsets)
-        _, colours = scene.trace(pose[:3, 3], scene.rays(pose, np.stack([x, y], axis=-1).reshape(-1, 2)))
-        assert photo[row, column] == pytest.approx(255 * colours.mean(axis=0), abs=0.51)
+        _, colors = scene.trace(pose[:3, 3], scene.rays(pose, np.stack([x, y], axis=-1).reshape(-1, 2)))
+        assert photo[row, column] == pytest.approx(255 * colors.mean(axis=0), abs=0.51)
 
 
 def test_rays_and_projection_are_inverse(scene: DemoScene) -> None:
@@ -107,9 +107,9 @@ def test_cameras_are_upright_rigid_and_inside_the_room(scene: DemoScene) -> None
 
 def test_every_ray_meets_a_surface(scene: DemoScene) -> None:
     for pose in np.concatenate(scene.cameras):
-        depth, colours = scene.trace(pose[:3, 3], scene.rays(pose, pixel_grid(scene, 1)))
+        depth, colors = scene.trace(pose[:3, 3], scene.rays(pose, pixel_grid(scene, 1)))
         assert np.isfinite(depth).all()
-        assert (colours > 0).any(axis=1).all()
+        assert (colors > 0).any(axis=1).all()
 
 
 def test_test_cameras_lie_between_training_cameras(scene: DemoScene) -> None:
@@ -187,15 +187,15 @@ def test_open3d_reads_the_sparse_points(scene: DemoScene, dataset: Path) -> None
     import open3d
 
     cloud = open3d.io.read_point_cloud(dataset / "sparse_pc.ply")
-    points, colours = scene.sparse_points()
+    points, colors = scene.sparse_points()
     assert np.asarray(cloud.points) == pytest.approx(points, abs=1e-5)
-    assert np.asarray(cloud.colors) * 255 == pytest.approx(colours.astype(float), abs=0.01)
+    assert np.asarray(cloud.colors) * 255 == pytest.approx(colors.astype(float), abs=0.01)
 
 
-def test_sparse_points_have_the_colours_of_the_photos(scene: DemoScene) -> None:
-    points, colours = scene.sparse_points()
-    assert points.shape == colours.shape == (4000, 3)
-    colours = colours / 255
+def test_sparse_points_have_the_colors_of_the_photos(scene: DemoScene) -> None:
+    points, colors = scene.sparse_points()
+    assert points.shape == colors.shape == (4000, 3)
+    colors = colors / 255
     differences, shuffled = [], []
     for pose in scene.cameras[1]:
         position, depth = project(scene, pose, points)
@@ -204,8 +204,8 @@ def test_sparse_points_have_the_colours_of_the_photos(scene: DemoScene) -> None:
         seen = in_frame(scene, position, depth) & (reached > 0.97)
         column, row = position[seen].astype(int).T
         photo = scene.render(pose)[row, column] / 255
-        differences.append(np.abs(photo - colours[seen]).mean(axis=1))
-        shuffled.append(np.abs(photo - np.roll(colours[seen], 1, axis=0)).mean(axis=1))
+        differences.append(np.abs(photo - colors[seen]).mean(axis=1))
+        shuffled.append(np.abs(photo - np.roll(colors[seen], 1, axis=0)).mean(axis=1))
     difference = np.concatenate(differences)
     assert len(difference) > 1000
     assert np.median(difference) < 0.05

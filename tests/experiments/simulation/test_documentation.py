@@ -25,7 +25,7 @@ def test_every_parameter_is_on_the_page_with_its_default(effect):
     for field in dataclasses.fields(effect_class(effect)):  # type: ignore[arg-type]
         row = next((line for line in text.splitlines() if f"`{field.name}`" in line), "")
         assert row, f"{effect}.{field.name}"
-        if row.count("_colour`") <= 1:
+        if row.count("_color`") <= 1:
             default = field.default
             if isinstance(default, float):
                 shown = f"{default:g}"

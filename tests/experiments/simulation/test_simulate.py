@@ -40,7 +40,7 @@ def load(path: Path, suffix: str = "") -> Layers:
 
 
 def exact(layers: Layers, photo: np.ndarray) -> np.ndarray:
-    """clip(T C + B) in float64, in grey levels."""
+    """clip(T C + B) in float64, in gray levels."""
     formed = layers.transmittance.astype(np.float64) * (photo / 255) + layers.addition
     return formed.clip(0, 1) * 255
 
@@ -102,7 +102,7 @@ def test_the_recorded_scene_repeats_the_run(tmp_path):
     run(data, tmp_path / "a", "--effects", "ui", "finger", "mud", "--seed", "9")
     record = yaml.safe_load((tmp_path / "a/scene.yaml").read_text())
     assert [effect["effect"] for effect in record["effects"]] == ["ui", "finger", "mud"]
-    assert record["effects"][2]["colour"] == [63, 42, 20]
+    assert record["effects"][2]["color"] == [63, 42, 20]
     assert record["seed"] == 9
     assert {"numpy", "opencv", "Pillow", "albumentations"} <= record["provenance"]["versions"].keys()
     run(data, tmp_path / "b", "--scene", str(tmp_path / "a/scene.yaml"))
@@ -184,7 +184,7 @@ def test_reduced_photos_become_a_dataset_of_their_own(stated_as, tmp_path):
     assert (tmp_path / "out/images/frame_000.jpg").read_bytes() == (data / "images_2/frame_000.jpg").read_bytes()
 
 
-def test_grey_and_opaque_rgba_photos_are_taken_as_rgb(tmp_path):
+def test_gray_and_opaque_rgba_photos_are_taken_as_rgb(tmp_path):
     data = write_dataset(tmp_path / "data", suffix=".png")
     for number, mode in ((1, "L"), (2, "RGBA")):
         path = data / f"images/frame_{number:03d}.png"

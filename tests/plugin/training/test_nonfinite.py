@@ -254,7 +254,7 @@ def test_a_sound_training_is_the_same_to_the_last_bit_without_guards(tiny_scene,
 
 @pytest.mark.parametrize("kind", ["ours", "fused", "foreach", "single", "sgd"])
 @pytest.mark.parametrize("scaler", [False, True])
-def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
+def test_any_optimizer_skips_and_then_goes_on(kind, scaler):
     parameter = torch.nn.Parameter(torch.ones(4))
     if kind == "sgd":
         optimizer: torch.optim.Optimizer = torch.optim.SGD([parameter], lr=0.1, momentum=0.9)
@@ -269,7 +269,7 @@ def test_any_optimiser_skips_and_then_goes_on(kind, scaler):
     seen = []
     for value in (1.0, math.nan, 1.0):
         parameter.grad = torch.full((4,), value)
-        # What breaks may belong to another optimiser: this one's gradient is fine and it must skip all the same.
+        # What breaks may belong to another optimizer: this one's gradient is fine and it must skip all the same.
         other = torch.nn.Parameter(torch.zeros(1))
         other.grad, parameter.grad = parameter.grad[:1].clone(), torch.ones(4) * (4.0 if scaler else 1.0)
         guard.judge({"p": optimizer, "other": torch.optim.SGD([other], lr=0.1)})
@@ -367,7 +367,7 @@ def test_a_checkpoint_between_two_looks_holds_the_steps_that_were_taken(tiny_sce
     assert counts == {7: {6}, 11: {9}}
 
 
-def test_optimisers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_path):
+def test_optimizers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_path):
     torch.manual_seed(0)
     config = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0})
     for entry in config.optimizers.values():
@@ -397,7 +397,7 @@ def test_cameras_and_bilateral_grids_skip_with_the_rest(tiny_scene, tmp_path, gr
 def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny_scene, tmp_path, capsys, overlay):
     trainer = make(tiny_scene, tmp_path, steps=110, overlay=overlay, max_skipped_steps=20, stop_split_at=1)
     spoil(trainer, range(40, 110), "opacities")
-    with pytest.raises(TrainingError) as caught:
+    with pytest.raises(TrainingError):
         trainer.train()
     assert trainer.step == 99, "the host looks every 100 steps"
     line = capsys.readouterr().err.strip().splitlines()[-1]
@@ -585,7 +585,7 @@ def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys, overlay, va
 
 
 def test_the_guard_never_waits_for_the_device_between_two_looks():
-    """Torch's own detector of host synchronisation needs CUDA; here every way of asking a tensor is forbidden."""
+    """Torch's own detector of host synchronization needs CUDA; here every way of asking a tensor is forbidden."""
     parameter = torch.nn.Parameter(torch.ones(3))
     optimizer = FusedAdam([parameter], lr=0.1)
     guard = StepGuard(limit=5)

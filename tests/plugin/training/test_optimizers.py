@@ -1,4 +1,4 @@
-"""All optimisers of a training at once: exact counts, and everything that nerfstudio's do."""
+"""All optimizers of a training at once: exact counts, and everything that nerfstudio's do."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NO_SCALER = torch.amp.GradScaler("cpu", enabled=False)
 
 
 def joint(guard: StepGuard | None = None, max_norm: float | None = None) -> tuple[JointOptimizers, list]:
-    """Optimisers of two groups, a and b, of one parameter of three numbers each, and those."""
+    """Optimizers of two groups, a and b, of one parameter of three numbers each, and those."""
     parameters = [torch.nn.Parameter(torch.zeros(3)) for _ in range(2)]
     config = {
         name: {
@@ -81,7 +81,7 @@ def test_a_scaler_of_gradients_is_asked():
     assert optimizers.optimizers["a"].state[a]["exp_avg"][0] == pytest.approx(0.1)
 
 
-def test_schedulers_find_optimisers_that_have_stepped():
+def test_schedulers_find_optimizers_that_have_stepped():
     optimizers, (a, b) = joint()
     a.grad, b.grad = torch.ones(3), torch.ones(3)
     with warnings.catch_warnings():

@@ -91,5 +91,5 @@ REAL_ABLATION: dict[tuple[str, str], tuple[float, float, float]] = {
     ("constant-start", "adc"): (16.573, 0.601, 0.396),
 }
 """Mean over the fifteen two-pass scenes."""
-COLOUR_DEVIATION: dict[str, float] = {"l1-0": 6.43, "paper": 3.19}
-"""Mean colour deviation on Mip-NeRF 360 under MCMC."""
+COLOR_DEVIATION: dict[str, float] = {"l1-0": 6.43, "paper": 3.19}
+"""Mean color deviation on Mip-NeRF 360 under MCMC."""

@@ -16,9 +16,9 @@ HEADINGS = {
     "psnr": "PSNR ↑",
     "ssim": "SSIM ↑",
     "flip": "FLIP ↓",
-    "mean_colour_deviation": "colour deviation ↓",
+    "mean_color_deviation": "color deviation ↓",
 }
-FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}", "mean_colour_deviation": "{:.2f}"}
+FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}", "mean_color_deviation": "{:.2f}"}
 ROW_NAMES = {CLEAN: "Clean (Ref)", MEAN: "Mean", "ui": "UI elements", "rain": "Rain spots"}
 SENSITIVITY = ("l1-0", "l1-0.01", "l1-0.05")
 ABLATION = {
@@ -58,10 +58,10 @@ def sensitivity(study: Study, with_paper: bool) -> Table | None:
 
 
 def ablation(study: Study, with_paper: bool) -> Table | None:
-    """Table `ablation` with the mean colour deviation; None where no such runs are there."""
+    """Table `ablation` with the mean color deviation; None where no such runs are there."""
     if not {"l1-0", "constant-start"} & set(study.methods):
         return None
-    metrics = [*METRICS, "mean_colour_deviation"]
+    metrics = [*METRICS, "mean_color_deviation"]
     densifications = " / ".join(d.upper() for d in study.densifications)
     rows = []
     for method, name in ABLATION.items():
@@ -75,7 +75,7 @@ def ablation(study: Study, with_paper: bool) -> Table | None:
         for (of, densification), triple in published.items():
             if with_paper and of == method:
                 deviation = (
-                    "" if real or method not in paper.COLOUR_DEVIATION else f"{paper.COLOUR_DEVIATION[method]:.2f}"
+                    "" if real or method not in paper.COLOR_DEVIATION else f"{paper.COLOR_DEVIATION[method]:.2f}"
                 )
                 figures = [FORMATS[m].format(v) for m, v in zip(METRICS, triple, strict=True)]
                 rows.append(
@@ -114,7 +114,7 @@ def artifact_itself(study: Study) -> Table | None:
     names = {
         "matte_error": "matte error ↓",
         "matte_iou": "IoU at 0.5 ↑",
-        "premultiplied_error": "colour error ↓",
+        "premultiplied_error": "color error ↓",
         "transmittance_error": "transmittance error ↓",
     }
     rows = []
@@ -135,7 +135,7 @@ def artifact_itself(study: Study) -> Table | None:
         return None
     note = (
         "Against the true layers, mean over scenes and seeds. Matte: A against the least opacity that explains the "
-        "artifact, max over channels of 1 - T and B. Colour: premultiplied A W against B. Mean absolute errors."
+        "artifact, max over channels of 1 - T and B. Color: premultiplied A W against B. Mean absolute errors."
     )
     return Table("The artifact itself", ["Artifact", "Method", "", *names.values()], rows, note)
 

@@ -31,7 +31,7 @@ COLUMNS: tuple[str, ...] = (
 """Of the CSV: a line for every point."""
 
 
-def analyse(folders: list[Path], output: Path, planned: set[str]) -> tuple[list[Path], list[str]]:
+def analyze(folders: list[Path], output: Path, planned: set[str]) -> tuple[list[Path], list[str]]:
     """Writes tradeoff.md and .html, tradeoff.csv, and a figure for every subject as PNG and SVG.
 
     Args:

@@ -31,11 +31,11 @@ KNOBS = {
     "rasterizer": "what draws the splats",
 }
 """For people who do not know the options by their names."""
-COLOURS = (
+COLORS = (
     *("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"),
     *("#7f7f00", "#8c564b", "#4d4d4d", "#8a2be2", "#bcbd22", "#17becf"),
 )
-"""Okabe and Ito's, which most colour-blind people tell apart, and some more."""
+"""Okabe and Ito's, which most color-blind people tell apart, and some more."""
 
 
 def draw(subject: Subject, folder: Path) -> list[Path]:
@@ -101,7 +101,7 @@ def _overview(axes: Axes, subject: Subject) -> None:
 
 
 def _panel(axes: Axes, subject: Subject, name: str) -> None:
-    """The runs that vary one knob, or several, coloured, before all others."""
+    """The runs that vary one knob, or several, colored, before all others."""
     chosen = [c for c in subject.curves if not c.knobs or c.knobs == (name,)]
     if name == TOGETHER:
         chosen = [c for c in subject.curves if len(c.knobs) != 1]
@@ -111,8 +111,8 @@ def _panel(axes: Axes, subject: Subject, name: str) -> None:
     for curve in chosen:
         label = curve.setting if name == TOGETHER else curve.value(name) + ("" if curve.knobs else " (base)")
         fresh = label not in labelled
-        colour = labelled.setdefault(label, COLOURS[len(labelled) % len(COLOURS)])
-        _line(axes, curve, color=colour, marker="o", markersize=3, label=textwrap.fill(label, 44) if fresh else None)
+        color = labelled.setdefault(label, COLORS[len(labelled) % len(COLORS)])
+        _line(axes, curve, color=color, marker="o", markersize=3, label=textwrap.fill(label, 44) if fresh else None)
     axes.set_title(f"{KNOBS[name]} ({name})" if name in KNOBS else name, fontsize=10)
     # Long names must not squeeze the panels.
     axes.legend(fontsize=7, frameon=False, loc="lower right").set_in_layout(False)
