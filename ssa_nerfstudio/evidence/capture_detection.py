@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -74,6 +75,24 @@ def detect_camera(camera: Camera, threads: int, console: Console | None = None, 
         camera.photos(threads), camera.name, camera.count, transient=True, console=console, disable=console is None
     )
     return detect(accumulate((torch.from_numpy(np.require(photo, requirements="W")), None) for photo in photos), draws)
+
+
+def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = None) -> dict[str, Detection]:
+    """Test whether photos carry a static artifact; poses are not needed.
+
+    Args:
+        data: a nerfstudio dataset (its training photos), a folder of photos or videos, or one video.
+        frames: frames to take from videos.
+        threads: photos decoded at once; one per core where None.
+
+    Returns:
+        One detection per camera, by name: `camera-1`, ...
+
+    Raises:
+        InputError: nothing usable is there, too few photos, or one that cannot be decoded.
+    """
+    threads = threads or os.cpu_count() or 1
+    return {camera.name: detect_camera(camera, threads) for camera in cameras_of(Path(data), frames)}
 
 
 def write_detections(folder: Path, found: dict[str, Detection]) -> None:

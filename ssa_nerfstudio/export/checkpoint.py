@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.artifacts import Artifacts, Overlay
 from ssa_nerfstudio.plugin.compat.upstream import allow_checkpoint_scalars
 from ssa_nerfstudio.plugin.training.checkpoints import damage, newest_first, step_of
 
@@ -91,3 +91,24 @@ class Checkpoint:
         own = {name.removeprefix(prefix): v for name, v in self.model.items() if name.startswith(prefix)}
         artifacts.load_state_dict(own)
         return artifacts
+
+
+def load_overlay(config: Path | str, camera: int = 0, step: int | None = None) -> Overlay:
+    """Load the overlay that a run learned; neither photos nor a GPU are needed.
+
+    Args:
+        config: the run's config.yml.
+        camera: camera group of a rig, in the order of the overlays.
+        step: which checkpoint; the newest where None.
+
+    Returns:
+        A module whose `layers()` are the transmittance T [H, W, 1 or 3] and addition B [H, W, 3] of I = T C + B, in
+        the undistorted frame.
+
+    Raises:
+        InputError: there is no such checkpoint, or it has no overlay for this camera.
+    """
+    artifacts = Checkpoint.read(Path(config), step).artifacts()
+    if not 0 <= camera < len(artifacts):
+        raise InputError(f"{config} has {len(artifacts)} overlays, not one of camera {camera}", "count from 0")
+    return artifacts[camera]

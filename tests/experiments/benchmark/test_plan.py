@@ -141,6 +141,6 @@ def test_marks_rise_to_the_last_step(steps, count):
 def test_a_faulty_file_is_refused_in_one_line(tmp_path, capsys, text, culprit):
     path = tmp_path / "faulty.yaml"
     path.write_text(text)
-    with pytest.raises(InputError, match=culprit) as refusal:
+    with pytest.raises(InputError, match=culprit):
         read_benchmark(str(path))
     assert capsys.readouterr().err.count("\n") == 1
