@@ -74,11 +74,11 @@ def test_values_become_what_the_fields_say():
         ({"rate": 1, "inner": 3}, "Inner must be keys and values, got 3"),
     ],
 )
-def test_wrong_values_are_named_in_one_line(values, message, capsys):
+def test_wrong_values_are_named_in_one_line(values, message):
     with pytest.raises(InputError) as caught:
         build(Outer, values, "file.yaml")
     assert f"file.yaml: {message}" in str(caught.value)
-    assert capsys.readouterr().err.count("\n") == 1
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
@@ -92,14 +92,14 @@ def test_wrong_values_are_named_in_one_line(values, message, capsys):
         (b"a: \xff", "cannot be read"),
     ],
 )
-def test_files_that_are_no_configuration_are_refused(text, message, tmp_path, capsys):
+def test_files_that_are_no_configuration_are_refused(text, message, tmp_path):
     path = tmp_path / "x.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError) as caught:
         read(path)
     assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_every_effect_is_shipped_with_its_defaults():
@@ -150,13 +150,13 @@ def test_names_and_files_are_found(tmp_path):
         ),
     ],
 )
-def test_bad_scenes_are_named_in_one_line(text, message, tmp_path, capsys):
+def test_bad_scenes_are_named_in_one_line(text, message, tmp_path):
     path = tmp_path / "scene.yaml"
     path.write_text(text)
     with pytest.raises(InputError) as caught:
         read_scene(str(path))
     assert message in str(caught.value)
-    assert capsys.readouterr().err.count("\n") == 1
+    assert "\n" not in str(caught.value)
     if "has no" not in message:
         assert str(path) in str(caught.value)
 

@@ -41,7 +41,7 @@ INVISIBLE = 1 / 255
 """Opacity below which a rasterizer skips a Gaussian."""
 
 
-class Diverged(ArithmeticError):
+class Diverged(TrainingError):
     """A training that left nothing to evaluate: values that are not finite, or no Gaussian that can be seen."""
 
 
@@ -291,7 +291,7 @@ def _train(trainer: SSATrainer) -> None:
     except TrainingError as error:
         if error.__cause__ is not None:  # the disk, not the numbers
             raise
-        raise Diverged(str(error)) from error
+        raise Diverged(error.problem, error.remedy) from error
     except (RuntimeError, ValueError, IndexError) as error:
         _require_alive(trainer.pipeline.model, error)
         raise

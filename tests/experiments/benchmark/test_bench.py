@@ -261,19 +261,22 @@ def test_bad_arguments_are_refused_in_one_line(tmp_path, monkeypatch, capsys, ar
     with pytest.raises(SystemExit) as refusal:
         main(["bench", *arguments, "--output", str(tmp_path / "out")])
     assert refusal.value.code == 2
-    assert culprit in str(refusal.value)
-    assert capsys.readouterr().err.count("\n") == 1
+    line = capsys.readouterr().err
+    assert culprit in line
+    assert line.count("\n") == 1
     assert not (tmp_path / "out" / "scenes").exists()
 
 
-def test_a_second_benchmark_in_one_folder_is_refused(tmp_path):
+def test_a_second_benchmark_in_one_folder_is_refused(tmp_path, capsys):
     with (tmp_path / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
-        with pytest.raises(SystemExit, match="another ssa bench"):
+        with pytest.raises(SystemExit):
             main(["bench", "smoke", "--output", str(tmp_path)])
+    assert "another ssa bench" in capsys.readouterr().err
 
 
-def test_an_output_that_is_a_file_is_refused(tmp_path):
+def test_an_output_that_is_a_file_is_refused(tmp_path, capsys):
     (tmp_path / "file").write_text("")
-    with pytest.raises(SystemExit, match="is a file"):
+    with pytest.raises(SystemExit):
         main(["bench", "smoke", "--output", str(tmp_path / "file")])
+    assert "is a file" in capsys.readouterr().err

@@ -119,10 +119,9 @@ def test_an_infinite_psnr_and_a_start_without_seconds_are_no_points(tmp_path):
     assert len(points(tmp_path / "out")) == 4 * 3 - 2
 
 
-def test_a_folder_without_curves_is_refused(tmp_path, capsys):
+def test_a_folder_without_curves_is_refused(tmp_path):
     with pytest.raises(InputError, match="no finished run of ssa tradeoff"):
         analyze([folder_of(tmp_path, [])], tmp_path / "out", IDS)
-    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_missing_runs_are_named(tmp_path):
