@@ -128,6 +128,8 @@ class SSATrainer(Trainer):
         """Load what the configuration names; what is wrong with it, if anything is."""
         try:
             super()._load_checkpoint()
+        except InputError:
+            raise  # of the settings: no other checkpoint helps
         except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError) as error:
             return (str(error) or type(error).__name__).splitlines()[0]
         broken = first_not_finite(self.pipeline.state_dict())
