@@ -11,19 +11,19 @@ from filelock import FileLock, Timeout
 from ssa_nerfstudio.errors import InputError
 
 LOCK = ".lock"
-"""Its file in the folder; the system lets go of it when the process ends, whatever ends it."""
+"""Name of the lock file in the folder. The operating system releases the lock however the process ends."""
 
 
 @contextmanager
-def held(folder: Path, command: str) -> Iterator[None]:
-    """Makes the folder and keeps every other process that asks for it out until the block ends.
+def locked_folder(folder: Path, command: str) -> Iterator[None]:
+    """Make a folder and lock out other processes that ask for it until the block ends.
 
     Args:
-        folder: to work in.
-        command: what the message calls the one that is there already: `ssa bench`.
+        folder: the folder to work in; made where missing.
+        command: name of the command for messages, such as `ssa bench`.
 
     Raises:
-        InputError: another process holds it, or it cannot be written.
+        InputError: another process holds the lock, or the folder cannot be written.
     """
     lock = FileLock(folder / LOCK)
     try:
@@ -31,11 +31,11 @@ def held(folder: Path, command: str) -> Iterator[None]:
         lock.acquire(blocking=False)
     except Timeout as error:
         raise InputError(
-            f"another {command} is at work in {folder}", "wait for it, or name another --output"
+            f"another {command} is at work in {folder}", "wait until it ends, or choose another output folder"
         ) from error
     except OSError as error:
         raise InputError(
-            f"{folder} cannot be written ({error})", "free space there or name another --output"
+            f"{folder} cannot be written ({error})", "free space there or choose another output folder"
         ) from error
     try:
         yield

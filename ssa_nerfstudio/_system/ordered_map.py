@@ -1,4 +1,4 @@
-"""Work on many items by several threads, the results in the items' order and few of them in memory."""
+"""A parallel map over threads that keeps the order and few results in memory."""
 
 from __future__ import annotations
 
@@ -11,13 +11,23 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
-def in_order(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
-    """Results in the items' order; at most three a thread are in memory."""
+def ordered_map(function: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """Map a function over items in threads.
+
+    Args:
+        function: called once for each item.
+        items: consumed only as far ahead as there are threads for.
+        threads: number of threads, at least 1.
+
+    Yields:
+        Results in the order of the items. At most `2 * threads + 1` are pending or unread at a time, unlike with
+        `ThreadPoolExecutor.map`, which submits everything at once.
+    """
     pending = deque()
     with ThreadPoolExecutor(threads) as pool:
         try:
             for item in items:
-                pending.append(pool.submit(work, item))
+                pending.append(pool.submit(function, item))
                 if len(pending) > 2 * threads:
                     yield pending.popleft().result()
             while pending:

@@ -16,7 +16,7 @@ from PIL import Image, ImageOps
 from rich.console import Console
 from rich.progress import track
 
-from ssa_nerfstudio._system.ordered_map import in_order
+from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.data.sources import Source, open_photo, read_source
@@ -56,7 +56,7 @@ def cameras_of(data: Path, frames: int) -> list[Camera]:
     source = read_source(data, "frame", least=LEAST_PHOTOS)
     if source.videos:
         return [Camera("camera-1", frames, lambda _: _frames(source, frames))]
-    return [Camera("camera-1", len(source.photos), partial(in_order, _read_upright, source.photos))]
+    return [Camera("camera-1", len(source.photos), partial(ordered_map, _read_upright, source.photos))]
 
 
 def detect_camera(camera: Camera, threads: int, console: Console | None = None, draws: int = DRAWS) -> Detection:
@@ -150,7 +150,7 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
                 f"{data}: {members[0].path} is the only photo of its camera",
                 f"what stays the same takes {LEAST_PHOTOS} to see: add photos or take it out",
             )
-        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(in_order, read, members)))
+        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(ordered_map, read, members)))
     return cameras
 
 

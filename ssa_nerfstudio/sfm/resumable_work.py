@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ssa_nerfstudio._system.file_lock import held
+from ssa_nerfstudio._system.file_lock import locked_folder
 from ssa_nerfstudio.errors import InputError
 
 
@@ -54,7 +54,7 @@ def resumable_work(output: Path) -> Iterator[Work]:
         InputError: `output` exists or cannot be written, another process works towards it, or memory ran out.
     """
     work = Work(output)
-    with held(work.folder, "ssa process"):
+    with locked_folder(work.folder, "ssa process"):
         try:
             # Only now: another process may have completed it before it let go of the work.
             if output.exists():

@@ -7,7 +7,7 @@ from multiprocessing import get_context
 
 from torch import Tensor
 
-from ssa_nerfstudio._system.process_lifetime import be_one_of_many
+from ssa_nerfstudio._system.process_lifetime import become_worker
 from ssa_nerfstudio.metrics import image as metrics
 from ssa_nerfstudio.metrics.flip import flip_error
 
@@ -20,7 +20,7 @@ class FlipProcesses:
         self._pool = None
         if processes > 1:
             # Started anew: a fork would take CUDA's state along.
-            self._pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=be_one_of_many)
+            self._pool = ProcessPoolExecutor(processes, get_context("spawn"), initializer=become_worker)
 
     def submit(self, render: Tensor, target: Tensor) -> Future[float]:
         """`metrics.flip` of a view, when it is done.

@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from ssa_nerfstudio._system.ordered_map import in_order
+from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
 from ssa_nerfstudio.cameras.lens import Lens, undistort, undistorted
 from ssa_nerfstudio.data.photos import read_photo, write_photo
@@ -52,7 +52,7 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
             return inside
 
         mean = _Mean()
-        for inside in in_order(work, [item for item in numbered if item[1].size == size], threads):
+        for inside in ordered_map(work, [item for item in numbered if item[1].size == size], threads):
             mean.add(inside)
             yield
         layers = artifact.whole(mean.value(), *size)
@@ -60,7 +60,7 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
             if view.size == size:
                 both = ((raw, layers), (straight, undistorted_layers(layers, view.lens)))
                 # Compressing them takes as long as dozens of photos.
-                list(in_order(lambda pair, camera=camera: pair[0].add(camera, pair[1]), both, threads))
+                list(ordered_map(lambda pair, camera=camera: pair[0].add(camera, pair[1]), both, threads))
 
 
 def undistorted_layers(layers: Layers, lens: Lens) -> Layers:

@@ -16,7 +16,7 @@ import psutil
 import pytest
 import torch
 
-from ssa_nerfstudio._system.process_lifetime import be_one_of_many
+from ssa_nerfstudio._system.process_lifetime import become_worker
 from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
 from ssa_nerfstudio.metrics import image as metrics
 from ssa_nerfstudio.metrics.flip import flip_error
@@ -52,7 +52,7 @@ def test_each_works_on_one_core(monkeypatch):
     """numpy's BLAS and OpenMP read how many there are when they are loaded."""
     for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         monkeypatch.delenv(name, raising=False)
-    with ProcessPoolExecutor(1, get_context("spawn"), be_one_of_many) as pool:
+    with ProcessPoolExecutor(1, get_context("spawn"), become_worker) as pool:
         pools = pool.submit(threads).result()
     assert pools
     assert set(pools.values()) == {1}

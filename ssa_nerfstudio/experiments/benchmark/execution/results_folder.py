@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ssa_nerfstudio._system.file_lock import held
+from ssa_nerfstudio._system.file_lock import locked_folder
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,6 @@ class Workplace:
         Raises:
             InputError: another process holds it, or it cannot be written.
         """
-        with held(self.folder, "ssa bench"):
+        with locked_folder(self.folder, "ssa bench"):
             shutil.rmtree(self.unfinished, ignore_errors=True)
             yield
