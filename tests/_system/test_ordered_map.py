@@ -31,7 +31,7 @@ def test_items_are_consumed_as_results_are_read():
     results = ordered_map(lambda item: item, items(), threads=2)
     assert next(results) == 1
     assert consumed == 5
-    results.close()
+    del results
 
 
 def test_an_error_reaches_the_reader_in_its_place():
