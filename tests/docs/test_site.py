@@ -53,7 +53,7 @@ def test_equations_are_drawn_by_the_browser_alone(site):
     assert "language-math" not in page
 
 
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -63,14 +63,42 @@ def test_every_module_that_a_page_names_exists(page):
     assert [name for name in ours if not any((root / name).exists() for root in (ROOT, ROOT / "ssa_nerfstudio"))] == []
     modules = re.findall(r"python -m (ssa_nerfstudio(?:\.\w+)+)", page.read_text())
     assert [name for name in modules if not (ROOT / (name.replace(".", "/") + ".py")).exists()] == []
+    scripts = re.findall(r"python ((?:benchmarks|docs|tests)/[\w/]+\.py)", page.read_text())
+    assert [name for name in scripts if not (ROOT / name).exists()] == []
 
 
-def test_the_architecture_names_every_room():
-    text = (ROOT / "docs/architecture.md").read_text()
+ARCHITECTURE = (ROOT / "docs/architecture.md").read_text()
+
+
+def test_the_architecture_page_names_every_folder():
     package = ROOT / "ssa_nerfstudio"
-    rooms = {f"`{p.name}/`" for p in package.iterdir() if (p / "__init__.py").exists()}
-    rooms |= {f"`{p.name}`" for p in package.glob("*.py") if not p.name.startswith("__")}
-    assert [room for room in sorted(rooms) if room not in text] == []
+    folders = {f"`{p.name}/`" for p in package.iterdir() if (p / "__init__.py").exists()}
+    folders |= {f"`{p.name}`" for p in package.glob("*.py") if not p.name.startswith("__")}
+    assert [folder for folder in sorted(folders) if folder not in ARCHITECTURE] == []
+
+
+def test_the_architecture_page_names_what_its_modules_define():
+    places = re.findall(r"((?:`\w+`(?:,| and| or) )*`\w+`)\s+in\s+`([\w/]+\.py)`", ARCHITECTURE)
+    assert len(places) >= 6
+    for names, module in places:
+        source = (ROOT / "ssa_nerfstudio" / module).read_text()
+        for name in re.findall(r"`(\w+)`", names):
+            assert re.search(rf"^(?:class |def )?{name}\b", source, re.MULTILINE), f"{module} defines no {name}"
+
+
+def test_the_diagram_of_imports_is_up_to_date():
+    pytest.importorskip("grimp", reason="import-linter is not installed; pip install -e '.[dev]'")
+    command = [sys.executable, "docs/import_diagram.py", "--check"]
+    done = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": str(ROOT)}
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_a_page_links_exists(page):
+    links = re.findall(r"\]\(([^)#:\s]+)(?:#[\w-]*)?\)", page.read_text())
+    assert [link for link in links if not (page.parent / link).exists()] == []
 
 
 def test_the_site_fetches_nothing_from_the_internet(site):
