@@ -79,8 +79,8 @@ def draw() -> str:
         '<path d="M0 0 L10 5 L0 10 z" fill="#555"/></marker></defs>\n'
         f'<rect width="{WIDTH}" height="{height}" rx="8" fill="#fff"/>\n'
         + "\n".join(parts)
-        + f'\n<text x="{WIDTH / 2:g}" y="{height - 14}" text-anchor="middle" font-size="12" fill="#555">{legend}</text>\n'
-        "</svg>\n"
+        + f'\n<text x="{WIDTH / 2:g}" y="{height - 14}" text-anchor="middle" font-size="12" fill="#555">{legend}</text>'
+        "\n</svg>\n"
     )
 
 
