@@ -13,12 +13,19 @@ from typing import Any, Literal
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+from ssa_nerfstudio.experiments.configuration import build
 
 FORMAT = "ssa-nerfstudio benchmark run"
 """Marks a file as one of ours."""
 VERSION = 2
 """Version 1 spelled the key `mean_color_deviation` another way; it is read, too."""
+MEASURED = ("psnr", "ssim", "flip")
+"""Metrics of every finished run."""
+STAGES = ("startup", "statistics", "training", "evaluation")
+"""Parts of a run whose seconds are counted."""
 Status = Literal["finished", "diverged", "failed"]
+Number = float | None
+"""None: infinity, which JSON lacks."""
 
 
 @dataclass
@@ -30,13 +37,13 @@ class Result:
     """finished; diverged: nothing to evaluate was left; failed: it ended in an error and will be tried again."""
     reason: str = ""
     """Of a run that did not finish."""
-    metrics: dict[str, float] = field(default_factory=dict)
+    metrics: dict[str, Number] = field(default_factory=dict)
     """Means over the test views: psnr (dB), ssim ("valid" padding), flip, mean_color_deviation (0..255), ..."""
-    views: dict[str, dict[str, float]] = field(default_factory=dict)
+    views: dict[str, dict[str, Number]] = field(default_factory=dict)
     """The same of each test view by its file's name."""
     artifact: dict[str, float] = field(default_factory=dict)
     """The learned overlay against the true layers (`artifact_scores.score`), mean over cameras."""
-    curve: list[dict[str, float]] = field(default_factory=list)
+    curve: list[dict[str, int | Number]] = field(default_factory=list)
     """Metrics along the run: step, seconds, gaussians, metrics."""
     seconds: dict[str, float] = field(default_factory=dict)
     """startup, statistics, training, evaluation; startup counts from when the run was asked for."""
@@ -94,12 +101,12 @@ def read(path: Path) -> Result:
         values = _renamed(values, "mean_colour_deviation", "mean_color_deviation") | {"version": VERSION}
     if values.get("version") != VERSION:
         raise InputError(f"{path} is of version {values.get('version')!r}, this reads version {VERSION}")
-    try:
-        known = {f.name for f in dataclasses.fields(Result)} - {"run"}
-        result = Result(run=Run.load(values["run"]), **{name: value for name, value in values.items() if name in known})
-        _check(result)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{path} lacks what a result holds ({type(error).__name__}: {error})") from error
+    known = {field.name for field in dataclasses.fields(Result)}
+    result = build(Result, {name: value for name, value in values.items() if name in known}, str(path))
+    if result.status == "finished":
+        for held, needed in ((result.metrics, MEASURED), (result.seconds, STAGES)):
+            if missing := [name for name in needed if name not in held]:
+                raise InputError(f"{path} is a finished run without {', '.join(missing)}")
     if result.run.id != path.stem:
         raise InputError(f"{path} holds the run {result.run.id}: renamed, or edited")
     return result
@@ -178,20 +185,6 @@ def _copy_companions(source: Path, run: str, target: Path, name: str) -> None:
         elif origin.exists():
             goal.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(origin, goal)
-
-
-def _check(result: Result) -> None:
-    """Types and values that everything behind relies on."""
-    if result.status not in ("finished", "diverged", "failed"):
-        raise ValueError(f"status {result.status!r}")
-    numbers = [*result.seconds.values(), *(n for view in result.views.values() for n in view.values())]
-    numbers += [n for point in result.curve for n in point.values()]
-    if not all(isinstance(n, (int, float)) or n is None for n in [*numbers, *result.metrics.values()]):
-        raise ValueError("a metric is no number")
-    if result.status == "finished" and not {"psnr", "ssim", "flip"} <= result.metrics.keys():
-        raise ValueError("a finished run without psnr, ssim and flip")
-    if result.status == "finished" and not {"startup", "statistics", "training", "evaluation"} <= result.seconds.keys():
-        raise ValueError("a finished run without its seconds")
 
 
 def _finite(value: Any) -> Any:

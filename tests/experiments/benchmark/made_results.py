@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 from ssa_nerfstudio.experiments.benchmark.results import Result, write
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark, Part, SceneEntry
@@ -29,7 +30,7 @@ def benchmark(**changes) -> Benchmark:
 def result(run: Run, **changes) -> Result:
     """A finished run: 20 dB and GAIN, 1 dB more under MCMC, 0.1 dB a seed, views 1 dB apart around that."""
     psnr = 20.0 + GAIN.get(run.method, -2.0) + (run.densification == "mcmc") + 0.1 * run.seed
-    views = {
+    views: dict[str, dict[str, Any]] = {
         f"view_{k}.png": {"psnr": psnr + k - 1, "ssim": 0.8, "flip": 0.2, "mean_color_deviation": 5.0} for k in range(3)
     }
     return dataclasses.replace(

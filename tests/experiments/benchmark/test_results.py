@@ -60,9 +60,9 @@ def _broken(values: dict, change: str) -> str:
     ("change", "why"),
     [
         ("status", "status"),
-        ("no seconds", "without its seconds"),
+        ("no seconds", "without startup"),
         ("no psnr", "without psnr"),
-        ("word for a number", "no number"),
+        ("word for a number", "psnr: .* valid number, got 'high'"),
         ("no run", "run"),
         ("half a run", "steps"),
         ("other run", "renamed, or edited"),

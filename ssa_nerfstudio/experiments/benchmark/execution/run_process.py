@@ -21,6 +21,7 @@ from ssa_nerfstudio._system.process_lifetime import end_with_parent
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
 from ssa_nerfstudio.experiments.benchmark.results import Result, write
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
+from ssa_nerfstudio.experiments.configuration import build
 
 if TYPE_CHECKING:
     from ssa_nerfstudio.plugin.pipeline import SSAPipeline
@@ -70,8 +71,7 @@ class Request:
     @classmethod
     def load(cls, path: Path) -> Request:
         """Read in the process."""
-        values = json.loads(path.read_text(encoding="utf-8"))
-        return cls(**{**values, "run": Run.load(values["run"])})
+        return build(cls, json.loads(path.read_text(encoding="utf-8")), str(path))
 
 
 def work(request: Request, revision: str) -> Result:
@@ -104,7 +104,9 @@ def work(request: Request, revision: str) -> Result:
         except training.Diverged as error:
             result.status, result.reason = "diverged", str(error)
         else:
-            result.metrics, result.views, result.curve = outcome.metrics, outcome.views, outcome.curve
+            result.metrics = {**outcome.metrics}
+            result.views = {name: {**view} for name, view in outcome.views.items()}
+            result.curve = [{**point} for point in outcome.curve]
             result.seconds = {**outcome.seconds, "startup": waited + outcome.seconds["startup"]}
             result.gaussians, result.peak_memory_mb = outcome.gaussians, outcome.peak_memory_mb
             note.stage("pictures")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ def bootstrap(groups: Sequence[Sequence[float]], level: float = 0.95, seed: int 
 
 
 def paired_differences(
-    views: dict[str, dict[str, float]], other: dict[str, dict[str, float]], metric: str
+    views: Mapping[str, Mapping[str, float | None]], other: Mapping[str, Mapping[str, float | None]], metric: str
 ) -> list[float]:
     """Metric of one run minus that of another, view by view, over the views that both have and where it is finite."""
     pairs = [(views[name].get(metric), other[name].get(metric)) for name in views if name in other]

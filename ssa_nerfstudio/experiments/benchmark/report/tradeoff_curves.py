@@ -36,7 +36,8 @@ class Curve:
     @property
     def points(self) -> list[dict[str, Any]]:
         """Its points with a finite PSNR and more than no seconds, by step."""
-        return [p for p in self.result.curve if p.get("psnr") is not None and p["seconds"] > 0]
+        points: list[dict[str, Any]] = [*self.result.curve]
+        return [p for p in points if p.get("psnr") is not None and p["seconds"] > 0]
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class SceneEntry:
     """What its training photos carry already (finger, mud, occlusion): then no effect is put in front of them."""
     cap_max: int | None = None
     """Largest number of Gaussians under MCMC; the method's own where not given."""
-    model: dict = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
     """Settings of the model for this scene."""
 
     def __post_init__(self) -> None:
@@ -89,11 +89,11 @@ class Tradeoff:
     """Names of scenes of the file."""
     effect: str = "dashboard"
     """What is put in front of them."""
-    knobs: dict = field(default_factory=dict)
+    knobs: dict[str, list[Any]] = field(default_factory=dict)
     """Knob to its settings: steps, image_scale, densification, or any setting of the model."""
-    together: tuple[Any, ...] = ()
+    together: tuple[dict[str, Any], ...] = ()
     """Mappings from knob to setting, each one run."""
-    base: dict = field(default_factory=dict)
+    base: dict[str, Any] = field(default_factory=dict)
     """Settings that all runs share unless they vary them."""
     steps: int = 7000
     """Steps of the base."""
@@ -106,11 +106,10 @@ class Tradeoff:
         if self.steps < 1 or self.marks < 1:
             raise ValueError("steps and marks must be at least 1")
         for name, settings in self.knobs.items():
-            if not isinstance(settings, list) or not settings:
-                raise ValueError(f"knobs.{name} must be a list of settings, got {settings!r}")
-        for number, variation in enumerate(self.together):
-            if not isinstance(variation, dict) or not variation:
-                raise ValueError(f"together[{number}] must be keys and values, got {variation!r}")
+            if not settings:
+                raise ValueError(f"knobs.{name} needs at least one setting")
+        if not all(self.together):
+            raise ValueError("each of together needs at least one knob")
         single = [{name: setting} for name, settings in self.knobs.items() for setting in settings]
         for settings in (self.base, *single, *self.together):
             _check_knobs(settings)
@@ -132,9 +131,9 @@ class Benchmark:
     """nerfstudio method that every row starts from: ssa-splatfacto, or ssa-splatfacto-paper."""
     protocol: Literal["own", "paper"] = "own"
     """paper: data, splits, resolutions, caps and schedules are the paper's, so its figures stand beside ours."""
-    model: dict = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
     """Settings of the model for all runs."""
-    candidates: dict = field(default_factory=dict)
+    candidates: dict[str, dict[str, Any]] = field(default_factory=dict)
     """More methods: name to settings that replace the default's, with the overlay on."""
     tradeoff: Tradeoff | None = None
     """What `ssa tradeoff` does with this file."""
@@ -149,8 +148,8 @@ class Benchmark:
             _check_names(settings, "a setting of the model")
         known = [*METHODS, *self.candidates]
         for name in self.candidates:
-            if name in METHODS or not isinstance(self.candidates[name], dict):
-                raise ValueError(f"candidate {name!r} must be keys and values under a name that no method has")
+            if name in METHODS:
+                raise ValueError(f"candidate {name!r} has the name of a method; choose another")
             _check_names(self.candidates[name], f"a setting of candidate {name!r}")
         _check_names(self.candidates, "a candidate")
         for part in self.parts:
@@ -189,7 +188,7 @@ def _check_knobs(settings: dict[Any, Any]) -> None:
 
 def _check_names(settings: dict[Any, Any], what: str) -> None:
     for name in settings:
-        if not isinstance(name, str) or not name:
+        if not name:
             raise ValueError(f"{what} must have a name, got {name!r}")
 
 

@@ -49,15 +49,6 @@ class Run:
     variation: dict[str, Any] = field(default_factory=dict)
     """Knobs that a tradeoff set for this run."""
 
-    @classmethod
-    def load(cls, values: dict[str, Any]) -> Run:
-        """From what JSON makes of a run.
-
-        Raises:
-            TypeError, KeyError: a value is missing, or one is too many.
-        """
-        return cls(**{**values, "marks": tuple(values["marks"])})
-
     def value(self, knob: str) -> Any:
         """What it sets a tradeoff's knob to, varied or not; None: whatever the method's default is."""
         return getattr(self, knob) if knob in RUN_KNOBS else self.model.get(knob)
