@@ -20,7 +20,6 @@ from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.data.photos import write_photo
 from ssa_nerfstudio.data.transforms import Dataset
-from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation import corruption
@@ -266,6 +265,8 @@ def test_half_of_the_bare_rate_is_kept(tmp_path):
 @pytest.mark.parametrize("arguments", [[], ["--effects", "ui", "--scene", "stock-video"]])
 def test_either_effects_or_a_scene_has_to_be_named(arguments, tmp_path, capsys):
     data = write_dataset(tmp_path / "data")
-    with pytest.raises(InputError, match="either --effects NAME"):
+    with pytest.raises(SystemExit) as caught:
         run(data, tmp_path / "out", *arguments)
-    assert capsys.readouterr().err.count("\n") == 1
+    assert caught.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "either --effects NAME" in line
