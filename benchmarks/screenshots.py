@@ -5,6 +5,7 @@ Chromium is the system's own (Debian: apt install chromium) and draws WebGL in s
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import shutil
@@ -21,13 +22,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssa_nerfstudio.errors import InputError, warn
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Route
 
+_log = logging.getLogger(__name__)
 _FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 _PATIENCE = 200
 """Seconds until a server has to answer: on a loaded machine most of them go into importing."""
@@ -118,7 +120,7 @@ def _keep_resolution(page: Page) -> None:
         answer = route.fetch()
         script, count = _ADAPTIVE_RATIO.subn("window.devicePixelRatio", answer.text())
         if count != 1:
-            warn("viser's page decides on its resolution in another way than 0.2.7 does; pictures may be soft")
+            _log.warning("viser's page decides on its resolution in another way than 0.2.7 does; pictures may be soft")
         route.fulfill(response=answer, body=script)
 
     page.route("**/assets/index-*.js", serve)

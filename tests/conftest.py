@@ -1,4 +1,7 @@
-"""What the tests share: where real captures are, and a tiny scene with a dashboard in front of it."""
+"""What the tests share: real captures, a tiny scene, and the experiments as fixtures.
+
+Tests of the product do not import the experiments; tests/test_layout.py holds that.
+"""
 
 from __future__ import annotations
 
@@ -7,15 +10,18 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import psutil
 import pytest
 import torch
 
-from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
-from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+if TYPE_CHECKING:
+    from ssa_nerfstudio.experiments.effects.layers import Layers
 
 torch.set_num_threads(1)
 
@@ -30,12 +36,89 @@ def captures() -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def configure_training() -> Callable:
+    """From the experiments: `configure`, a method's configuration for an unattended run."""
+    from ssa_nerfstudio.experiments.runs.training_run import configure
+
+    return configure
+
+
+@pytest.fixture(scope="session")
+def train_and_evaluate() -> Callable:
+    """From the experiments: `train_and_evaluate`, a training to its end and the metrics of its test views."""
+    from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+
+    return train_and_evaluate
+
+
+@pytest.fixture(scope="session")
+def training_imports() -> str:
+    """From the experiments: what imports the two in a program that a test runs as a process of its own."""
+    module = "ssa_nerfstudio.experiments.runs.training_run"
+    return f"from {module} import configure as configure_training, train_and_evaluate\n"
+
+
+@pytest.fixture(scope="session")
+def draw_effect() -> Callable[..., Layers]:
+    """From the experiments: draws an effect, given its name, height and width in pixels, and a seed."""
+    from ssa_nerfstudio.experiments.effects.catalogue import effect_class
+    from ssa_nerfstudio.experiments.effects.layers import Layers
+
+    def draw(name: str, height: int, width: int, seed: int = 0) -> Layers:
+        layers = effect_class(name)().layers(height, width, np.random.default_rng(seed))
+        assert isinstance(layers, Layers), f"{name} varies from view to view"
+        return layers
+
+    return draw
+
+
+@pytest.fixture(scope="session")
+def composited_layers() -> Callable[..., Layers]:
+    """From the experiments: `Layers.composited`, the layers of a matte and a color."""
+    from ssa_nerfstudio.experiments.effects.layers import Layers
+
+    return Layers.composited
+
+
+@pytest.fixture(scope="session")
+def undistorted_layers() -> Callable[..., Layers]:
+    """From the experiments: `undistorted_layers`, an artifact of the raw frame in the undistorted one."""
+    from ssa_nerfstudio.experiments.simulation.corruption import undistorted_layers
+
+    return undistorted_layers
+
+
+@pytest.fixture(scope="session")
+def write_built_in_scene() -> Callable[..., Path]:
+    """From the experiments: writes the built-in scene, given the folder, its fields and the artifact in front."""
+    from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+
+    def write(folder: Path, artifact: Layers | None = None, **fields: int) -> Path:
+        DemoScene(**fields).write(folder, artifact)
+        return folder
+
+    return write
+
+
+@pytest.fixture(scope="session")
+def photos() -> Callable[[int], list[np.ndarray]]:
+    """From the experiments: renders of the built-in scene along `small_captures.poses`, given their number.
+
+    Small, uint8 [168, 224, 3], and textured enough for structure from motion.
+    """
+    from small_captures import HEIGHT, WIDTH, poses
+
+    from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+
+    scene = DemoScene(width=WIDTH, height=HEIGHT)
+    return cache(lambda count: [scene.render(pose) for pose in poses(count)])
+
+
+@pytest.fixture(scope="session")
+def tiny_scene(tmp_path_factory: pytest.TempPathFactory, write_built_in_scene, draw_effect) -> Path:
     """A dataset of 12 training views of 64 x 48 pixels behind a dashboard, and 3 clean test views. Read only."""
-    scene = DemoScene(views=12, test_views=3, width=64, height=48)
     folder = tmp_path_factory.mktemp("scene") / "dashboard"
-    scene.write(folder, Dashboard().layers(scene.height, scene.width, np.random.default_rng(0)))
-    return folder
+    return write_built_in_scene(folder, draw_effect("dashboard", 48, 64), views=12, test_views=3, width=64, height=48)
 
 
 @pytest.fixture

@@ -1,17 +1,14 @@
-"""Photos of the built-in scene from a smooth arc: small, and textured enough for structure from motion."""
+"""A smooth arc of cameras in the built-in scene, whose renders are the fixture `photos`."""
 
 from __future__ import annotations
 
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
-
 WIDTH, HEIGHT = 224, 168
-_SCENE = DemoScene(width=WIDTH, height=HEIGHT)
+"""Of the photos, pixels."""
 
 
 def poses(count: int) -> np.ndarray:
@@ -27,12 +24,6 @@ def poses(count: int) -> np.ndarray:
     result[:, :3, :3] = axes / np.linalg.norm(axes, axis=1, keepdims=True)
     result[:, :3, 3] = position
     return result
-
-
-@cache
-def photos(count: int) -> list[np.ndarray]:
-    """What the cameras see, uint8 [168, 224, 3] each."""
-    return [_SCENE.render(pose) for pose in poses(count)]
 
 
 def write(folder: Path, pictures: list[np.ndarray], suffix: str = ".png", **options) -> Path:

@@ -14,23 +14,13 @@ from small_checkpoints import cameras, one_camera, write_run
 
 from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.experiments.effects.catalogue import effect_class
-from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
-from ssa_nerfstudio.experiments.simulation.corruption import undistorted_layers
 from ssa_nerfstudio.export.artifact_files import FILES
 from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
 
 WIDTH, HEIGHT = 96, 64
 
 
-def draw(effect: str, width: int = WIDTH, height: int = HEIGHT) -> Layers:
-    layers = effect_class(effect)().layers(height, width, np.random.default_rng(0))
-    assert isinstance(layers, Layers)
-    return layers
-
-
-def given(layers: Layers) -> GivenOverlay:
+def given(layers) -> GivenOverlay:
     return GivenOverlay(torch.from_numpy(layers.transmittance), torch.from_numpy(layers.addition))
 
 
@@ -67,8 +57,8 @@ def photo(seed: int = 0, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray
 
 
 @pytest.mark.parametrize("effect", ["watermark", "ui", "dashboard", "mud", "dust", "vignette"])
-def test_a_given_artifact_comes_back_within_a_gray_level(tmp_path, effect):
-    layers = draw(effect)
+def test_a_given_artifact_comes_back_within_a_gray_level(tmp_path, effect, draw_effect):
+    layers = draw_effect(effect, HEIGHT, WIDTH)
     export(write_run(tmp_path / "run", one_camera(given(layers))), tmp_path / "out")
     truth = layers.apply(photo()).astype(float)
     for name in ("overlay.png", "overlay_16bit.png"):
@@ -103,17 +93,21 @@ def test_every_file_shows_the_learned_overlay(tmp_path, resolution):
     assert about["cameras"][0]["mean_matte"] == pytest.approx(alpha.mean(), rel=1e-5)
 
 
-def test_nerfstudio_and_colmap_keep_what_is_white(tmp_path):
+def test_nerfstudio_and_colmap_keep_what_is_white(tmp_path, draw_effect):
     from nerfstudio.data.utils.data_utils import get_image_mask_tensor_from_path
 
-    export(write_run(tmp_path / "run", one_camera(given(draw("dashboard")))), tmp_path / "out", "--raw-frame")
+    export(
+        write_run(tmp_path / "run", one_camera(given(draw_effect("dashboard", HEIGHT, WIDTH)))),
+        tmp_path / "out",
+        "--raw-frame",
+    )
     kept = get_image_mask_tensor_from_path(tmp_path / "out" / "mask_white_is_scene.png")[..., 0].numpy()
     assert kept[:20].all()
     assert not kept[-10:].any()
 
 
-def test_light_that_no_rgba_picture_can_hold_is_reported(tmp_path):
-    rain, mark = draw("rain"), draw("watermark")
+def test_light_that_no_rgba_picture_can_hold_is_reported(tmp_path, draw_effect):
+    rain, mark = draw_effect("rain", HEIGHT, WIDTH), draw_effect("watermark", HEIGHT, WIDTH)
     lost = [
         export(write_run(tmp_path / name, one_camera(given(layers))), tmp_path / f"out-{name}")["cameras"][0]
         for name, layers in (("rain", rain), ("mark", mark))
@@ -179,11 +173,11 @@ def test_photos_lose_light_and_it_is_told_where_they_are_white_by_it(tmp_path, c
     np.testing.assert_array_equal(seen == 0, lost)
 
 
-def test_the_layers_can_be_given_to_another_training(tmp_path, tiny_scene):
+def test_the_layers_can_be_given_to_another_training(tmp_path, tiny_scene, configure_training, train_and_evaluate):
     config = write_run(tmp_path / "run", one_camera(learned(64, 48)))
     export(config, tmp_path / "out")
     model = {"num_downscales": 0, "overlay": "given", "overlay_given": tmp_path / "out" / "layers.npz"}
-    _, pipeline, _ = train_and_evaluate(configure("ssa-splatfacto", tiny_scene, tmp_path / "again", 1, model))
+    _, pipeline, _ = train_and_evaluate(configure_training("ssa-splatfacto", tiny_scene, tmp_path / "again", 1, model))
     transmittance, _ = learned(64, 48).layers()
     torch.testing.assert_close(pipeline.model.artifacts[0].layers()[0], transmittance.detach().expand(-1, -1, 3))
 
@@ -205,9 +199,9 @@ LENSES = {
 
 
 @pytest.mark.parametrize("model", sorted(LENSES))
-def test_the_raw_frame_is_that_of_the_photos(tmp_path, model):
+def test_the_raw_frame_is_that_of_the_photos(tmp_path, model, draw_effect, undistorted_layers):
     lens = LENSES[model]
-    raw = draw("watermark")
+    raw = draw_effect("watermark", HEIGHT, WIDTH)
     target = undistorted(lens)
     inside = undistorted_layers(raw, lens)
     config = write_run(tmp_path / "run", one_camera(given(inside), lens))
@@ -222,10 +216,10 @@ def test_the_raw_frame_is_that_of_the_photos(tmp_path, model):
     assert error.mean() < 2
 
 
-def test_masks_of_the_raw_frame_go_on_to_its_border(tmp_path):
+def test_masks_of_the_raw_frame_go_on_to_its_border(tmp_path, draw_effect, undistorted_layers):
     """Nothing is learned of what undistortion crops away, but a dashboard does not end there."""
     lens = LENSES["perspective"]
-    raw = draw("dashboard")
+    raw = draw_effect("dashboard", HEIGHT, WIDTH)
     config = write_run(tmp_path / "run", one_camera(given(undistorted_layers(raw, lens)), lens))
     export(config, tmp_path / "out", "--raw-frame")
     artifact = np.asarray(Image.open(tmp_path / "out" / "mask_white_is_artifact.png")) > 0
@@ -237,11 +231,13 @@ def test_masks_of_the_raw_frame_go_on_to_its_border(tmp_path):
 
 
 @pytest.mark.parametrize(("effect", "highest"), [("watermark", 12), ("dashboard", 40)])
-def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(captures, tmp_path, effect, highest):
+def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(
+    captures, tmp_path, effect, highest, draw_effect, undistorted_layers
+):
     t = json.loads((captures / "gopro_walk" / "transforms.json").read_text())
     distortion = tuple(float(t.get(name, 0)) for name in ("k1", "k2", "k3", "k4", "p1", "p2"))
     lens = Lens(t["w"], t["h"], t["fl_x"], t["fl_y"], t["cx"], t["cy"], distortion)
-    raw = draw(effect, lens.width, lens.height)
+    raw = draw_effect(effect, lens.height, lens.width)
     inside = undistorted_layers(raw, lens)
     export(write_run(tmp_path / "run", one_camera(given(inside), lens)), tmp_path / "out", "--raw-frame")
     clean = np.asarray(Image.open(captures / "gopro_walk" / t["frames"][10]["file_path"]).convert("RGB"))
@@ -253,11 +249,11 @@ def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(captures
     assert np.percentile(error, 99) < highest
 
 
-def test_a_training_keeps_its_lens_in_the_checkpoint(broken_scene, tmp_path):
+def test_a_training_keeps_its_lens_in_the_checkpoint(broken_scene, tmp_path, configure_training, train_and_evaluate):
     from conftest import edit_transforms
 
     edit_transforms(broken_scene, k1=-0.1, k2=0.02)
-    _, pipeline, config = train_and_evaluate(configure("ssa-splatfacto", broken_scene, tmp_path, 1))
+    _, pipeline, config = train_and_evaluate(configure_training("ssa-splatfacto", broken_scene, tmp_path, 1))
     overlay = pipeline.model.artifacts[0]
     assert (overlay.height, overlay.width) != (48, 64)
     about = export(config, tmp_path / "out", "--raw-frame")["cameras"][0]
@@ -287,8 +283,8 @@ def test_a_checkpoint_of_the_first_version_is_still_read(tmp_path, capsys):
     assert not (tmp_path / "raw").exists()
 
 
-def test_photos_lose_a_watermark_and_keep_the_rest(tmp_path, capsys):
-    layers = draw("watermark")
+def test_photos_lose_a_watermark_and_keep_the_rest(tmp_path, capsys, draw_effect):
+    layers = draw_effect("watermark", HEIGHT, WIDTH)
     (tmp_path / "photos" / "day 1").mkdir(parents=True)
     truth = photo(1)
     Image.fromarray(layers.apply(truth)).save(tmp_path / "photos" / "day 1" / "a.png")
@@ -302,8 +298,8 @@ def test_photos_lose_a_watermark_and_keep_the_rest(tmp_path, capsys):
     assert "adds light" not in said
 
 
-def test_what_an_opaque_artifact_hides_is_black_and_counted(tmp_path, capsys):
-    layers = draw("dashboard")
+def test_what_an_opaque_artifact_hides_is_black_and_counted(tmp_path, capsys, draw_effect):
+    layers = draw_effect("dashboard", HEIGHT, WIDTH)
     (tmp_path / "photos").mkdir()
     truth = photo(2)
     Image.fromarray(layers.apply(truth)).save(tmp_path / "photos" / "a.png")
@@ -319,23 +315,26 @@ def test_what_an_opaque_artifact_hides_is_black_and_counted(tmp_path, capsys):
     assert f"{hidden.mean():.1%} of their pixels" in capsys.readouterr().out
 
 
-def test_original_photos_of_twice_the_size_are_restored(tmp_path):
-    large = draw("watermark", 2 * WIDTH, 2 * HEIGHT)
-    small = Layers(
-        *(cv2.resize(p, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA) for p in (large.transmittance, large.addition))
-    )
+def test_original_photos_of_twice_the_size_are_restored(tmp_path, draw_effect):
+    large = draw_effect("watermark", 2 * HEIGHT, 2 * WIDTH)
+    small = [
+        torch.from_numpy(cv2.resize(p, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA))
+        for p in (large.transmittance, large.addition)
+    ]
     (tmp_path / "photos").mkdir()
     truth = photo(3, 2 * WIDTH, 2 * HEIGHT)
     Image.fromarray(large.apply(truth)).save(tmp_path / "photos" / "a.png")
-    export(write_run(tmp_path / "run", one_camera(given(small))), tmp_path / "out", "--apply", tmp_path / "photos")
+    export(
+        write_run(tmp_path / "run", one_camera(GivenOverlay(*small))), tmp_path / "out", "--apply", tmp_path / "photos"
+    )
     restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
     before = np.abs(large.apply(truth).astype(int) - truth).mean()
     assert np.abs(restored - truth).mean() < 0.35 * before
 
 
-def test_photos_of_a_rig_need_to_know_their_camera(tmp_path, capsys):
+def test_photos_of_a_rig_need_to_know_their_camera(tmp_path, capsys, draw_effect):
     lenses = [Lens(WIDTH, HEIGHT, 60, 60, 48, 32), Lens(WIDTH, HEIGHT, 80, 80, 48, 32)]
-    marks = [draw("watermark"), draw("ui")]
+    marks = [draw_effect("watermark", HEIGHT, WIDTH), draw_effect("ui", HEIGHT, WIDTH)]
     pairs = [(given(layers), lens) for layers, lens in zip(marks, lenses, strict=True)]
     config = write_run(tmp_path / "run", cameras(pairs))
     (tmp_path / "photos").mkdir()

@@ -13,7 +13,6 @@ from plyfile import PlyData
 from small_checkpoints import random_gaussians, write_run
 
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 
 
 def export(config: Path, output: Path, *options: object) -> Path:
@@ -22,11 +21,11 @@ def export(config: Path, output: Path, *options: object) -> Path:
 
 
 @pytest.fixture(scope="module", params=[3, 0], ids=["harmonics", "plain-colors"])
-def run(request, tiny_scene, tmp_path_factory) -> Path:
+def run(request, tiny_scene, tmp_path_factory, configure_training, train_and_evaluate) -> Path:
     """A trained run, some of whose Gaussians no exporter may write."""
     folder = tmp_path_factory.mktemp("run")
     model = {"num_downscales": 0, "sh_degree": request.param}
-    _, _, config = train_and_evaluate(configure("ssa-splatfacto", tiny_scene, folder, 2, model))
+    _, _, config = train_and_evaluate(configure_training("ssa-splatfacto", tiny_scene, folder, 2, model))
     path = next((config.parent / "nerfstudio_models").iterdir())
     saved = torch.load(path)
     state = saved["pipeline"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,35 +15,38 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from benchmarks.guards import Training
-from ssa_nerfstudio.experiments.runs.training_run import METHODS, configure, train_and_evaluate
-from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 from ssa_nerfstudio.plugin import overlay_setup as first_look
+from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 
 @pytest.fixture(scope="module")
-def clean_scene(tmp_path_factory) -> Path:
+def clean_scene(tmp_path_factory, write_built_in_scene) -> Path:
     """The tiny scene without its dashboard."""
     folder = tmp_path_factory.mktemp("clean") / "scene"
-    DemoScene(views=12, test_views=3, width=64, height=48).write(folder, None)
+    write_built_in_scene(folder, views=12, test_views=3, width=64, height=48)
     return folder
 
 
-def losses(data: Path, output: Path, overlay: str, steps: int = 50) -> tuple[list[dict[str, float]], SSATrainer]:
-    """Every loss of every step."""
-    torch.manual_seed(0)
-    np.random.seed(0)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
-    config = configure("ssa-splatfacto", data, output, steps, {"overlay": overlay})
-    config.set_timestamp()
-    trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    training = Training(trainer)
-    seen = [{name: float(value) for name, value in training.step().items()} for _ in range(steps)]
-    return seen, trainer
+@pytest.fixture(scope="session")
+def losses(configure_training):
+    def losses(data: Path, output: Path, overlay: str, steps: int = 50) -> tuple[list[dict[str, float]], SSATrainer]:
+        """Every loss of every step."""
+        torch.manual_seed(0)
+        np.random.seed(0)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
+        config = configure_training("ssa-splatfacto", data, output, steps, {"overlay": overlay})
+        config.set_timestamp()
+        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        training = Training(trainer)
+        seen = [{name: float(value) for name, value in training.step().items()} for _ in range(steps)]
+        return seen, trainer
+
+    return losses
 
 
-def test_a_clean_scene_pays_for_nothing(clean_scene, tmp_path):
+def test_a_clean_scene_pays_for_nothing(clean_scene, tmp_path, losses):
     """No parameter, optimizer or output of an overlay, and 50 steps whose losses are overlay-off's bit for bit."""
     off, _ = losses(clean_scene, tmp_path, "off")
     auto, trainer = losses(clean_scene, tmp_path, "auto")
@@ -58,7 +62,7 @@ def test_a_clean_scene_pays_for_nothing(clean_scene, tmp_path):
     assert not {"composite", "overlay_rgb", "overlay_alpha"} & drawn.keys()
 
 
-def test_a_dashboard_is_learned_where_it_was_found(tiny_scene, tmp_path, monkeypatch):
+def test_a_dashboard_is_learned_where_it_was_found(tiny_scene, tmp_path, monkeypatch, losses):
     """The same losses as with "on", and the area comes from the one detection."""
     on, _ = losses(tiny_scene, tmp_path, "on", steps=5)
 
@@ -72,9 +76,11 @@ def test_a_dashboard_is_learned_where_it_was_found(tiny_scene, tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("scene", ["clean_scene", "tiny_scene"])
-def test_resuming_and_reloading_never_look_again(scene, tmp_path, request, monkeypatch):
+def test_resuming_and_reloading_never_look_again(
+    scene, tmp_path, request, monkeypatch, configure_training, train_and_evaluate
+):
     data = request.getfixturevalue(scene)
-    config = configure("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
+    config = configure_training("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
     config.max_num_iterations = 4
     _, first, path = train_and_evaluate(config)
 
@@ -83,7 +89,7 @@ def test_resuming_and_reloading_never_look_again(scene, tmp_path, request, monke
 
     monkeypatch.setattr(first_look, "detect", never)
     monkeypatch.setattr(first_look, "accumulate", never)
-    resumed = configure("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
+    resumed = configure_training("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
     resumed.load_dir = path.parent / "nerfstudio_models"
     _, second, again = train_and_evaluate(resumed)
     assert len(first.model.artifacts) == len(second.model.artifacts) == (scene == "tiny_scene")
@@ -98,7 +104,7 @@ def test_resuming_and_reloading_never_look_again(scene, tmp_path, request, monke
         assert len(saved["pipeline"]["_model.artifacts.bare_keys"]) == 1
 
 
-def test_each_camera_of_a_rig_has_its_own_verdict(clean_scene, tmp_path):
+def test_each_camera_of_a_rig_has_its_own_verdict(clean_scene, tmp_path, configure_training, train_and_evaluate):
     """Two cameras, a board in front of the second only: the first has no overlay, in training and in evaluation."""
     scene = Path(shutil.copytree(clean_scene, tmp_path / "scene"))
     transforms = json.loads((scene / "transforms.json").read_text())
@@ -119,22 +125,24 @@ def test_each_camera_of_a_rig_has_its_own_verdict(clean_scene, tmp_path):
     path = scene / "transforms.json"
     path.write_text(json.dumps({k: v for k, v in transforms.items() if k not in shared}))
     edit_transforms(scene, frames=frames, **names)
-    _, pipeline, config = train_and_evaluate(configure("ssa-splatfacto", scene, tmp_path, 6, {"num_downscales": 0}))
+    _, pipeline, config = train_and_evaluate(
+        configure_training("ssa-splatfacto", scene, tmp_path, 6, {"num_downscales": 0})
+    )
     artifacts = pipeline.model.artifacts
     assert (len(artifacts), artifacts.bare_keys.shape[0]) == (1, 1)
     assert {artifacts._group_of_view[i] is None for i in range(24)} == {True, False}
     pipeline.eval()
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]  # the first camera's
     assert "composite" not in pipeline.model.get_outputs_for_camera(camera)
-    resumed = configure("ssa-splatfacto", scene, tmp_path, 9, {"num_downscales": 0})
+    resumed = configure_training("ssa-splatfacto", scene, tmp_path, 9, {"num_downscales": 0})
     resumed.load_dir = config.parent / "nerfstudio_models"
     _, second, _ = train_and_evaluate(resumed)
     assert second.model.artifacts._group_of_view == artifacts._group_of_view
 
 
-def test_one_line_says_what_was_decided(clean_scene, tiny_scene, tmp_path, capsys):
+def test_one_line_says_what_was_decided(clean_scene, tiny_scene, tmp_path, capsys, configure_training):
     for data, expected in ((clean_scene, "training without an overlay"), (tiny_scene, "opaque")):
-        config = configure("ssa-splatfacto", data, tmp_path, 1, {"num_downscales": 0})
+        config = configure_training("ssa-splatfacto", data, tmp_path, 1, {"num_downscales": 0})
         config.set_timestamp()
         config.setup(local_rank=0, world_size=1).setup()
         told = " ".join(capsys.readouterr().out.split())
@@ -143,14 +151,17 @@ def test_one_line_says_what_was_decided(clean_scene, tiny_scene, tmp_path, capsy
 
 
 def test_auto_is_the_default_except_for_the_papers_protocol():
-    settings = {name: config.pipeline.model.overlay for name, config in METHODS.items()}
+    methods: list[Any] = [spec.config for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)]
+    settings = {config.method_name: config.pipeline.model.overlay for config in methods}
     assert settings == {"ssa-splatfacto": "auto", "ssa-splatfacto-mcmc": "auto", "ssa-splatfacto-paper": "on"}
 
 
-def test_resuming_without_an_overlay_cannot_force_one(clean_scene, tmp_path, capsys):
-    config = configure("ssa-splatfacto", clean_scene, tmp_path, 2, {"num_downscales": 0})
+def test_resuming_without_an_overlay_cannot_force_one(
+    clean_scene, tmp_path, capsys, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto", clean_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
-    other = configure("ssa-splatfacto", clean_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "on"})
+    other = configure_training("ssa-splatfacto", clean_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "on"})
     other.load_dir = path.parent / "nerfstudio_models"
     with pytest.raises(SystemExit) as refused:
         train_and_evaluate(other)

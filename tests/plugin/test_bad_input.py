@@ -14,7 +14,6 @@ import torch
 from conftest import edit_transforms
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 
 
 def refusal(run: Callable) -> str:
@@ -26,11 +25,15 @@ def refusal(run: Callable) -> str:
     return line
 
 
-def train(data: Path, output: Path, steps: int = 2, **changes) -> None:
-    config = configure("ssa-splatfacto", data, output, steps, {"num_downscales": 0})
-    for name, value in changes.items():
-        setattr(config, name, value)
-    train_and_evaluate(config)
+@pytest.fixture(scope="session")
+def train(configure_training, train_and_evaluate):
+    def train(data: Path, output: Path, steps: int = 2, **changes) -> None:
+        config = configure_training("ssa-splatfacto", data, output, steps, {"num_downscales": 0})
+        for name, value in changes.items():
+            setattr(config, name, value)
+        train_and_evaluate(config)
+
+    return train
 
 
 def edit_frames(scene: Path, edit: Callable[[list[dict]], list[dict]]) -> None:
@@ -42,35 +45,35 @@ def edit_frames(scene: Path, edit: Callable[[list[dict]], list[dict]]) -> None:
     path.write_text(json.dumps(transforms))
 
 
-def test_a_folder_that_does_not_exist_is_named(tmp_path):
+def test_a_folder_that_does_not_exist_is_named(tmp_path, train):
     assert str(tmp_path / "nowhere") in refusal(lambda: train(tmp_path / "nowhere", tmp_path))
 
 
-def test_a_folder_without_transforms_tells_how_to_make_them(tmp_path):
+def test_a_folder_without_transforms_tells_how_to_make_them(tmp_path, train):
     assert "ns-process-data" in refusal(lambda: train(tmp_path, tmp_path / "out"))
 
 
-def test_a_dataset_without_photos_is_refused(broken_scene, tmp_path):
+def test_a_dataset_without_photos_is_refused(broken_scene, tmp_path, train):
     edit_frames(broken_scene, lambda frames: [])
     assert "lists 0 photos" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_a_single_photo_is_refused(broken_scene, tmp_path):
+def test_a_single_photo_is_refused(broken_scene, tmp_path, train):
     edit_frames(broken_scene, lambda frames: frames[:1])
     assert "lists 1 photos; at least 2" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_a_split_that_leaves_one_photo_to_train_on_is_refused(broken_scene, tmp_path):
+def test_a_split_that_leaves_one_photo_to_train_on_is_refused(broken_scene, tmp_path, train):
     edit_frames(broken_scene, lambda frames: frames[:2])
     assert "leaves 1 photos to train on" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_a_missing_photo_is_named(broken_scene, tmp_path):
+def test_a_missing_photo_is_named(broken_scene, tmp_path, train):
     (broken_scene / "images" / "train_0003.png").unlink()
     assert "train_0003.png, which does not exist" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_a_truncated_photo_is_named(broken_scene, tmp_path):
+def test_a_truncated_photo_is_named(broken_scene, tmp_path, train):
     photo = broken_scene / "images" / "train_0004.png"
     photo.write_bytes(photo.read_bytes()[:200])
     message = refusal(lambda: train(broken_scene, tmp_path / "out"))
@@ -78,12 +81,12 @@ def test_a_truncated_photo_is_named(broken_scene, tmp_path):
     assert "remove its frame" in message
 
 
-def test_a_text_file_named_like_a_photo_is_named(broken_scene, tmp_path):
+def test_a_text_file_named_like_a_photo_is_named(broken_scene, tmp_path, train):
     (broken_scene / "images" / "train_0005.png").write_text("no photo")
     assert "train_0005.png cannot be read as a photo" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_a_photo_of_another_size_is_refused(broken_scene, tmp_path):
+def test_a_photo_of_another_size_is_refused(broken_scene, tmp_path, train):
     from PIL import Image
 
     path = broken_scene / "images" / "train_0002.png"
@@ -92,7 +95,7 @@ def test_a_photo_of_another_size_is_refused(broken_scene, tmp_path):
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "x", None])
-def test_a_pose_that_is_no_number_names_its_photo(broken_scene, tmp_path, value):
+def test_a_pose_that_is_no_number_names_its_photo(broken_scene, tmp_path, value, train):
     def spoil(frames: list[dict]) -> list[dict]:
         frames[7]["transform_matrix"][1][3] = value
         return frames
@@ -102,43 +105,47 @@ def test_a_pose_that_is_no_number_names_its_photo(broken_scene, tmp_path, value)
     assert f"the pose of {name}" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_transforms_that_are_no_json_are_named(broken_scene, tmp_path):
+def test_transforms_that_are_no_json_are_named(broken_scene, tmp_path, train):
     (broken_scene / "transforms.json").write_text("{")
     assert "transforms.json is no valid JSON" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this machine has CUDA")
-def test_cuda_where_there_is_none_is_refused_with_the_flag_that_helps(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2)
+def test_cuda_where_there_is_none_is_refused_with_the_flag_that_helps(
+    tiny_scene, tmp_path, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2)
     config.machine.device_type = "cuda"
     assert "--machine.device-type cpu" in refusal(lambda: train_and_evaluate(config))
 
 
-def test_resuming_with_photos_of_another_size_is_refused(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+def test_resuming_with_photos_of_another_size_is_refused(tiny_scene, tmp_path, configure_training, train_and_evaluate):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
-    other = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0}, scale_factor=0.5)
+    other = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0}, scale_factor=0.5)
     other.load_dir = path.parent / "nerfstudio_models"
     message = refusal(lambda: train_and_evaluate(other))
     assert "(64, 48)" in message
     assert "(32, 24)" in message
 
 
-def test_resuming_an_overlay_without_one_is_refused(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+def test_resuming_an_overlay_without_one_is_refused(tiny_scene, tmp_path, configure_training, train_and_evaluate):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
-    other = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "off"})
+    other = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "off"})
     other.load_dir = path.parent / "nerfstudio_models"
     assert "--pipeline.model.overlay on" in refusal(lambda: train_and_evaluate(other))
 
 
-def test_resuming_from_an_empty_folder_is_refused(tiny_scene, tmp_path):
+def test_resuming_from_an_empty_folder_is_refused(tiny_scene, tmp_path, train):
     assert "holds no step-*.ckpt" in refusal(lambda: train(tiny_scene, tmp_path / "out", load_dir=tmp_path))
 
 
 @pytest.mark.parametrize("named", [False, True])
-def test_resuming_from_half_a_checkpoint_is_refused(tiny_scene, tmp_path, named):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+def test_resuming_from_half_a_checkpoint_is_refused(
+    tiny_scene, tmp_path, named, train, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
     checkpoint = next((path.parent / "nerfstudio_models").glob("*.ckpt"))
     checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
@@ -147,13 +154,15 @@ def test_resuming_from_half_a_checkpoint_is_refused(tiny_scene, tmp_path, named)
     assert ("--load-step" if named else "holds no checkpoint that can be read") in message
 
 
-def test_resuming_a_learned_overlay_with_a_given_one_is_refused(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
+def test_resuming_a_learned_overlay_with_a_given_one_is_refused(
+    tiny_scene, tmp_path, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
     layers = tmp_path / "layers.npz"
     np.savez(layers, T=np.ones((48, 64, 3)), B=np.zeros((48, 64, 3)))
     model = {"num_downscales": 0, "overlay": "given", "overlay_given": layers}
-    other = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, model)
+    other = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 4, model)
     other.load_dir = path.parent / "nerfstudio_models"
     assert "trained with overlay on, this run has given" in refusal(lambda: train_and_evaluate(other))
 
@@ -166,18 +175,20 @@ def test_resuming_a_learned_overlay_with_a_given_one_is_refused(tiny_scene, tmp_
         ({"rasterizer": "gsplat"}, "does not run on cpu"),
     ],
 )
-def test_settings_that_cannot_work_are_refused(tiny_scene, tmp_path, model, complaint):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, model)
+def test_settings_that_cannot_work_are_refused(
+    tiny_scene, tmp_path, model, complaint, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, model)
     config.machine.device_type = "cpu"
     assert complaint in refusal(lambda: train_and_evaluate(config))
 
 
-def test_a_focal_length_that_is_no_number_is_refused(broken_scene, tmp_path):
+def test_a_focal_length_that_is_no_number_is_refused(broken_scene, tmp_path, train):
     edit_transforms(broken_scene, fl_x=float("nan"))
     assert "intrinsics of" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
-def test_frames_that_are_no_objects_are_refused(broken_scene, tmp_path):
+def test_frames_that_are_no_objects_are_refused(broken_scene, tmp_path, train):
     edit_transforms(broken_scene, frames=["a", "b", "c"])
     assert "the frame 'a'" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
@@ -192,10 +203,12 @@ def test_frames_that_are_no_objects_are_refused(broken_scene, tmp_path):
         ({"T": np.ones((24, 32, 3)), "B": np.zeros((24, 32, 3))}, "48 x 64"),
     ],
 )
-def test_given_layers_that_do_not_fit_are_refused(tiny_scene, tmp_path, arrays, complaint):
+def test_given_layers_that_do_not_fit_are_refused(
+    tiny_scene, tmp_path, arrays, complaint, configure_training, train_and_evaluate
+):
     path = tmp_path / "layers.npz"
     np.savez(path, **arrays)
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 2, {"overlay": "given", "overlay_given": path})
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"overlay": "given", "overlay_given": path})
     assert complaint in refusal(lambda: train_and_evaluate(config))
 
 

@@ -11,7 +11,6 @@ import pytest
 from PIL import Image
 
 from benchmarks import screenshots
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 from ssa_nerfstudio.export.checkpoint import Checkpoint
 from ssa_nerfstudio.overlay.layer import fitted
 from ssa_nerfstudio.overlay.resampling import straight_color
@@ -20,10 +19,10 @@ pytestmark = pytest.mark.browser
 
 
 @pytest.fixture(scope="module")
-def config(tiny_scene, tmp_path_factory) -> Path:
+def config(tiny_scene, tmp_path_factory, configure_training, train_and_evaluate) -> Path:
     """A tiny model trained on the CPU rasterizer."""
     folder = tmp_path_factory.mktemp("run")
-    return train_and_evaluate(configure("ssa-splatfacto", tiny_scene, folder, 80, {"num_downscales": 0}))[2]
+    return train_and_evaluate(configure_training("ssa-splatfacto", tiny_scene, folder, 80, {"num_downscales": 0}))[2]
 
 
 @pytest.fixture(scope="module")

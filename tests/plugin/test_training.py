@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,24 +16,37 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from ssa_nerfstudio.evidence.statistics import accumulate
-from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
-from ssa_nerfstudio.experiments.runs.training_run import METHODS, configure, train_and_evaluate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.training.schedules import scaled
 
+METHODS: dict[str, Any] = {
+    str(spec.config.method_name): spec.config for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
+}
 
-def run(data: Path, output: Path, steps: int, method: str = "ssa-splatfacto", **model):
-    return train_and_evaluate(configure(method, data, output, steps, {"num_downscales": 0, "overlay": "on", **model}))
+
+@pytest.fixture(scope="session")
+def run(configure_training, train_and_evaluate):
+    def run(data: Path, output: Path, steps: int, method: str = "ssa-splatfacto", **model):
+        return train_and_evaluate(
+            configure_training(method, data, output, steps, {"num_downscales": 0, "overlay": "on", **model})
+        )
+
+    return run
 
 
-def dashboard_layers(path: Path) -> Path:
-    layers = Dashboard().layers(48, 64, np.random.default_rng(0))
-    np.savez(path, T=layers.transmittance, B=layers.addition)
-    return path
+@pytest.fixture(scope="session")
+def dashboard_layers(draw_effect):
+    def dashboard_layers(path: Path) -> Path:
+        layers = draw_effect("dashboard", 48, 64)
+        np.savez(path, T=layers.transmittance, B=layers.addition)
+        return path
+
+    return dashboard_layers
 
 
 @pytest.fixture(scope="module")
-def trained(tiny_scene, tmp_path_factory):
+def trained(tiny_scene, tmp_path_factory, dashboard_layers, run):
     """80 steps without, with a learned and with the true overlay, on the same scene."""
     folder = tmp_path_factory.mktemp("trained")
     given = dashboard_layers(folder / "layers.npz")
@@ -50,9 +64,9 @@ def test_an_overlay_recovers_the_scene_behind_a_dashboard(trained):
     assert psnr["given"] > psnr["off"] + 1.0
 
 
-def test_the_matte_learned_is_the_dashboard(trained):
+def test_the_matte_learned_is_the_dashboard(trained, draw_effect):
     _, pipeline, _ = trained["on"]
-    truth = Dashboard().layers(48, 64, np.random.default_rng(0)).matte
+    truth = draw_effect("dashboard", 48, 64).matte
     matte = pipeline.model.artifacts.learned()[0].matte().detach().numpy()[..., 0]
     assert matte[truth > 0.99].mean() > 0.9
     assert matte[truth < 0.01].mean() < 0.15
@@ -84,9 +98,9 @@ def test_without_an_overlay_there_is_none_of_it(trained):
     assert "composite_psnr" not in outcome.metrics
 
 
-def test_a_given_overlay_is_buffers_and_does_not_learn(trained):
+def test_a_given_overlay_is_buffers_and_does_not_learn(trained, draw_effect):
     _, pipeline, _ = trained["given"]
-    layers = Dashboard().layers(48, 64, np.random.default_rng(0))
+    layers = draw_effect("dashboard", 48, 64)
     assert "overlay" not in pipeline.get_param_groups()
     transmittance, addition = pipeline.model.artifacts[0].layers()
     np.testing.assert_array_equal(transmittance.numpy(), layers.transmittance)
@@ -111,7 +125,7 @@ def test_metrics_are_of_the_clean_render_and_complete(trained):
     assert "lpips" not in outcome.metrics
 
 
-def test_training_twice_gives_the_same_scene(tiny_scene, tmp_path):
+def test_training_twice_gives_the_same_scene(tiny_scene, tmp_path, run):
     (_, a, _), (_, b, _) = (run(tiny_scene, tmp_path / name, 12) for name in "ab")
     assert all(torch.equal(x, b.model.state_dict()[name]) for name, x in a.model.state_dict().items())
 
@@ -119,11 +133,13 @@ def test_training_twice_gives_the_same_scene(tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     "model", [{}, {"overlay": "off"}, {"overlay_light": "on"}, {"strategy": "mcmc", "cap_max": 4200}]
 )
-def test_a_resumed_run_finishes_the_run_and_trains_what_it_loaded(tiny_scene, tmp_path, model):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
+def test_a_resumed_run_finishes_the_run_and_trains_what_it_loaded(
+    tiny_scene, tmp_path, model, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
     config.max_num_iterations = 10
     _, first, path = train_and_evaluate(config)
-    resumed = configure("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
+    resumed = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 20, {"num_downscales": 0, **model})
     resumed.load_dir = path.parent / "nerfstudio_models"
     _, second, resumed_path = train_and_evaluate(resumed)
     checkpoints = sorted((resumed_path.parent / "nerfstudio_models").glob("step-*.ckpt"))
@@ -134,10 +150,10 @@ def test_a_resumed_run_finishes_the_run_and_trains_what_it_loaded(tiny_scene, tm
     assert not torch.equal(means["first"][:100], means["second"][:100])
 
 
-def test_a_finished_run_is_not_trained_again(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 6, {"num_downscales": 0})
+def test_a_finished_run_is_not_trained_again(tiny_scene, tmp_path, configure_training, train_and_evaluate):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 6, {"num_downscales": 0})
     _, first, path = train_and_evaluate(config)
-    again = configure("ssa-splatfacto", tiny_scene, tmp_path, 6, {"num_downscales": 0})
+    again = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 6, {"num_downscales": 0})
     again.load_dir = path.parent / "nerfstudio_models"
     _, second, _ = train_and_evaluate(again)
     assert torch.equal(first.model.means, second.model.means)
@@ -145,9 +161,11 @@ def test_a_finished_run_is_not_trained_again(tiny_scene, tmp_path):
 
 @pytest.mark.parametrize("method", sorted(METHODS))
 @pytest.mark.parametrize("reduction", [0, 2])
-def test_every_method_trains_at_full_and_reduced_resolution(tiny_scene, tmp_path, method, reduction):
+def test_every_method_trains_at_full_and_reduced_resolution(
+    tiny_scene, tmp_path, method, reduction, configure_training, train_and_evaluate
+):
     model = {"num_downscales": reduction, "resolution_schedule": 15_000}
-    outcome, pipeline, _ = train_and_evaluate(configure(method, tiny_scene, tmp_path, 12, model))
+    outcome, pipeline, _ = train_and_evaluate(configure_training(method, tiny_scene, tmp_path, 12, model))
     assert np.isfinite(outcome.metrics["psnr"])
     assert all(torch.isfinite(p).all() for p in pipeline.model.parameters())
 
@@ -169,14 +187,14 @@ def test_every_method_trains_at_full_and_reduced_resolution(tiny_scene, tmp_path
     ],
     ids=lambda model: "-".join(model),
 )
-def test_settings_can_be_combined(tiny_scene, tmp_path, model):
-    outcome, pipeline, _ = train_and_evaluate(configure("ssa-splatfacto", tiny_scene, tmp_path, 4, model))
+def test_settings_can_be_combined(tiny_scene, tmp_path, model, configure_training, train_and_evaluate):
+    outcome, pipeline, _ = train_and_evaluate(configure_training("ssa-splatfacto", tiny_scene, tmp_path, 4, model))
     assert np.isfinite(outcome.metrics["psnr"])
     size = -(-48 // model.get("overlay_downscale", 1)), -(-64 // model.get("overlay_downscale", 1))
     assert pipeline.model.artifacts.learned()[0].matte().shape[:2] == size
 
 
-def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path):
+def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path, run):
     _, pipeline, _ = run(tiny_scene, tmp_path, 1, overlay_start="statistics")
     photos = pipeline.datamanager.cached_train
     deviation = accumulate((photo["image"], None) for photo in photos).deviation()
@@ -186,7 +204,7 @@ def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path
     assert drift.abs().max() < 4 * 0.0051
 
 
-def test_light_in_front_of_the_photos_is_recognized_learned_and_reloaded(broken_scene, tmp_path):
+def test_light_in_front_of_the_photos_is_recognized_learned_and_reloaded(broken_scene, tmp_path, run):
     """Spots that add to the scene: the model adds light, clips as a photo does, and a reloaded one still does."""
     rng = np.random.default_rng(0)
     spots = np.zeros((48, 64, 3), np.uint8)
@@ -206,7 +224,7 @@ def test_light_in_front_of_the_photos_is_recognized_learned_and_reloaded(broken_
     assert artifacts.exceed_white
 
 
-def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path):
+def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path, run):
     from PIL import Image
 
     frames = json.loads((broken_scene / "transforms.json").read_text())["frames"]
@@ -219,7 +237,7 @@ def test_masked_pixels_do_not_reach_the_overlay(broken_scene, tmp_path):
     assert matte[:10, :10].max() < 0.02
 
 
-def test_a_rig_gets_an_overlay_for_each_of_its_cameras(broken_scene, tmp_path):
+def test_a_rig_gets_an_overlay_for_each_of_its_cameras(broken_scene, tmp_path, run):
     transforms = json.loads((broken_scene / "transforms.json").read_text())
     shared = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     for number, frame in enumerate(transforms["frames"]):
@@ -298,8 +316,10 @@ def test_the_papers_protocol_is_what_the_paper_says():
     assert config.optimizers["overlay"]["scheduler"] is None
 
 
-def test_the_papers_protocol_scales_the_means_by_the_cameras_extent(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto-paper", tiny_scene, tmp_path, 2)
+def test_the_papers_protocol_scales_the_means_by_the_cameras_extent(
+    tiny_scene, tmp_path, configure_training, train_and_evaluate
+):
+    config = configure_training("ssa-splatfacto-paper", tiny_scene, tmp_path, 2)
     _, pipeline, _ = train_and_evaluate(config)
     positions = pipeline.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3]
     extent = 1.1 * (positions - positions.mean(dim=0)).norm(dim=1).max()

@@ -13,7 +13,6 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.viewer import OnDemand
 
@@ -38,11 +37,11 @@ def frame(model, camera) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def pipelines(tiny_scene, tmp_path_factory):
+def pipelines(tiny_scene, tmp_path_factory, configure_training, train_and_evaluate):
     folder = tmp_path_factory.mktemp("viewer")
     return {
         overlay: train_and_evaluate(
-            configure("ssa-splatfacto", tiny_scene, folder, 40, {"num_downscales": 0, "overlay": overlay})
+            configure_training("ssa-splatfacto", tiny_scene, folder, 40, {"num_downscales": 0, "overlay": overlay})
         )[1].eval()
         for overlay in ("on", "off")
     }

@@ -12,7 +12,7 @@ import numpy as np
 import psutil
 import pytest
 from PIL import Image
-from small_captures import HEIGHT, WIDTH, photos, write
+from small_captures import HEIGHT, WIDTH, write
 
 from ssa_nerfstudio.cli import main
 
@@ -99,7 +99,7 @@ def test_photos_that_show_nothing_in_common_stop_the_command(tmp_path, capsys):
 
 
 @pytest.mark.parametrize("blocks", [1, 300, 600], ids=["photos", "database", "more of the database"])
-def test_a_full_disk(blocks, tmp_path):
+def test_a_full_disk(blocks, tmp_path, photos):
     """A real process whose files may not grow beyond a limit, as on a full disk."""
     write(tmp_path / "photos", photos(8))
     command = f'ulimit -f {blocks}; exec "$0" -m ssa_nerfstudio process --threads 1 --train photos --output out'
@@ -110,7 +110,7 @@ def test_a_full_disk(blocks, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
 
 
-def test_memory_that_runs_out_costs_no_work(tmp_path):
+def test_memory_that_runs_out_costs_no_work(tmp_path, photos):
     """As systems do it: the largest process, which is COLMAP's, is killed."""
     write(tmp_path / "photos", photos(8))
     command = [sys.executable, "-m", "ssa_nerfstudio", "process", "--threads", "1", "--train", "photos"]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from small_captures import HEIGHT, WIDTH, photos, write
+from small_captures import HEIGHT, WIDTH, write
 
-from ssa_nerfstudio.experiments.effects.mud import Mud
 from ssa_nerfstudio.sfm.flat_field import flattened, static_factor
 
 VIEWS = 24
@@ -18,8 +17,8 @@ def high_pass(picture: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_mud_is_found_and_taken_out(seed, tmp_path):
-    layers = Mud().layers(HEIGHT, WIDTH, np.random.default_rng(seed))
+def test_mud_is_found_and_taken_out(seed, tmp_path, draw_effect, photos):
+    layers = draw_effect("mud", HEIGHT, WIDTH, seed)
     muddy = [layers.apply(photo) for photo in photos(VIEWS)]
     folder = write(tmp_path / "muddy", muddy)
     factor = static_factor(sorted(folder.iterdir()), 1600)
@@ -35,12 +34,12 @@ def test_mud_is_found_and_taken_out(seed, tmp_path):
         assert speckle(flattened(before, factor), clean) < 0.75 * speckle(before, clean)
 
 
-def test_clean_photos_have_none(tmp_path):
+def test_clean_photos_have_none(tmp_path, photos):
     folder = write(tmp_path / "clean", photos(VIEWS))
     assert static_factor(sorted(folder.iterdir()), 1600) is None
 
 
-def test_one_photo_over_and_over_is_static_altogether(tmp_path):
+def test_one_photo_over_and_over_is_static_altogether(tmp_path, photos):
     """The limit of the method: where nothing moves, everything is static, and flat when it is taken out."""
     folder = write(tmp_path / "same", photos(VIEWS)[:1] * 8)
     factor = static_factor(sorted(folder.iterdir()), 1600)
@@ -50,8 +49,8 @@ def test_one_photo_over_and_over_is_static_altogether(tmp_path):
     assert detail[1] < 0.2 * detail[0]
 
 
-def test_the_factor_of_large_photos_is_found_at_a_smaller_size(tmp_path):
-    layers = Mud().layers(HEIGHT, WIDTH, np.random.default_rng(0))
+def test_the_factor_of_large_photos_is_found_at_a_smaller_size(tmp_path, draw_effect, photos):
+    layers = draw_effect("mud", HEIGHT, WIDTH)
     folder = write(tmp_path / "muddy", [layers.apply(photo) for photo in photos(VIEWS)])
     factor = static_factor(sorted(folder.iterdir()), 112)
     assert factor is not None

@@ -14,17 +14,17 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.process_data.colmap_utils import colmap_to_json
 from PIL import Image
 from plyfile import PlyData
-from small_captures import HEIGHT, WIDTH, photos, poses, write
+from small_captures import HEIGHT, WIDTH, poses, write
 
 from benchmarks.alignment import center_errors
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 
 VIEWS = 16
 
 
-def covered() -> list[np.ndarray]:
-    layers = Dashboard().layers(HEIGHT, WIDTH, np.random.default_rng(0))
+@pytest.fixture(scope="module")
+def covered(draw_effect, photos) -> list[np.ndarray]:
+    layers = draw_effect("dashboard", HEIGHT, WIDTH)
     return [layers.apply(photo) for photo in photos(VIEWS)]
 
 
@@ -33,12 +33,12 @@ def process(*options: object) -> None:
 
 
 @pytest.fixture(scope="module")
-def two_pass(tmp_path_factory) -> Path:
+def two_pass(tmp_path_factory, covered, draw_effect, photos) -> Path:
     """Every other view behind a dashboard, the others clean, through the command with a mask."""
     folder = tmp_path_factory.mktemp("capture")
-    write(folder / "artifact", covered()[::2])
+    write(folder / "artifact", covered[::2])
     write(folder / "clean", photos(VIEWS)[1::2])
-    transmittance = Dashboard().layers(HEIGHT, WIDTH, np.random.default_rng(0)).transmittance
+    transmittance = draw_effect("dashboard", HEIGHT, WIDTH).transmittance
     Image.fromarray(transmittance.min(axis=-1) > 0.9).save(folder / "mask.png")
     process(
         "--train", folder / "artifact", "--clean", folder / "clean", "--mask", folder / "mask.png",
@@ -92,7 +92,7 @@ def test_the_dataset_is_the_one_that_nerfstudio_would_have_made_of_the_same_mode
     assert len(clouds[0]) > 200
 
 
-def test_a_killed_run_goes_on_where_it_was(tmp_path, capsys):
+def test_a_killed_run_goes_on_where_it_was(tmp_path, capsys, photos):
     """A real process, killed with SIGKILL when its features are done; nothing of it looks like a dataset.
 
     While it runs, a second one is refused and leaves the work alone.
@@ -118,13 +118,13 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "photos"]
 
 
-def test_an_opaque_artifact_is_detected_and_masked(tmp_path, capsys):
-    write(tmp_path / "photos", covered())
+def test_an_opaque_artifact_is_detected_and_masked(tmp_path, capsys, covered, draw_effect):
+    write(tmp_path / "photos", covered)
     process("--train", tmp_path / "photos", "--output", tmp_path / "out", "--detect", "--no-flatten")
     said = capsys.readouterr().out
     assert f"{VIEWS} of {VIEWS} frame photos registered" in said
     used = np.asarray(Image.open(tmp_path / "out/mask_colmap.png"))
-    true = Dashboard().layers(HEIGHT, WIDTH, np.random.default_rng(0)).transmittance.min(axis=-1) > 0.9
+    true = draw_effect("dashboard", HEIGHT, WIDTH).transmittance.min(axis=-1) > 0.9
     assert used.shape == true.shape
     both, either = (~used & ~true).sum(), (~used | ~true).sum()
     assert both / either > 0.8

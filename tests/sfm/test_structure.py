@@ -7,11 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from small_captures import HEIGHT, WIDTH, photos, poses, write
+from small_captures import HEIGHT, WIDTH, poses, write
 
 from benchmarks.alignment import center_errors, similarity
 from ssa_nerfstudio.data.sources import read_source
-from ssa_nerfstudio.experiments.effects.mud import Mud
 from ssa_nerfstudio.sfm.photos_to_dataset import process
 from ssa_nerfstudio.sfm.reconstruction import MODEL, Pass, Settings
 
@@ -22,7 +21,7 @@ class Interrupted(Exception):
     """As a signal would."""
 
 
-def test_features_and_matches_are_made_once(tmp_path):
+def test_features_and_matches_are_made_once(tmp_path, photos):
     """Interrupted within features and within matches, the next run starts with what is done and finds the same."""
     import PIL.Image  # noqa: F401 - before pycolmap
     import pycolmap
@@ -65,9 +64,9 @@ def test_features_and_matches_are_made_once(tmp_path):
     assert whole.num_points3D() == pytest.approx(stopped.num_points3D(), rel=0.02)
 
 
-def test_mud_all_over_the_frame(tmp_path):
+def test_mud_all_over_the_frame(tmp_path, draw_effect, photos):
     """COLMAP alone finds the mud, which does not move, and few photos; without the mud in them it finds the scene."""
-    layers = Mud().layers(HEIGHT, WIDTH, np.random.default_rng(0))
+    layers = draw_effect("mud", HEIGHT, WIDTH)
     folder = write(tmp_path / "photos", [layers.apply(photo) for photo in photos(24)])
     true = poses(24)[:, :3, 3]
     source = read_source(folder, "frame", least=3)

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
-from small_captures import HEIGHT, WIDTH, photos, write
+from small_captures import HEIGHT, WIDTH, write
 
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.sfm.photos_to_dataset import MASK
 
 BIN = Path(sys.executable).parent
@@ -29,8 +28,8 @@ def run(*command: object) -> str:
     return done.stdout
 
 
-def test_artifact_photos_train_and_clean_photos_judge_and_the_matte_is_a_mask_for_poses(tmp_path):
-    layers = Dashboard().layers(HEIGHT, WIDTH, np.random.default_rng(0))
+def test_artifact_photos_train_and_clean_photos_judge_and_the_matte_is_a_mask_for_poses(tmp_path, draw_effect, photos):
+    layers = draw_effect("dashboard", HEIGHT, WIDTH)
     pictures = photos(16)
     # No mask: what is the same in all photos is found by the command itself.
     train = write(tmp_path / "artifact", [layers.apply(picture) for picture in pictures[::2]])

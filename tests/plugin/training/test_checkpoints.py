@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 from ssa_nerfstudio.plugin.training.checkpoints import PARTIAL, newest_first, written_whole
 
 TRAIN = """
@@ -20,10 +19,9 @@ import os, resource, signal, sys
 from pathlib import Path
 import torch
 torch.set_num_threads(1)
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 
 data, output, fault = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-config = configure("ssa-splatfacto", data, output, 30, {"num_downscales": 0, "stop_split_at": 1})
+config = configure_training("ssa-splatfacto", data, output, 30, {"num_downscales": 0, "stop_split_at": 1})
 config.steps_per_save = 10
 
 def on_step(step):
@@ -45,30 +43,40 @@ train_and_evaluate(config, on_step)
 """
 
 
-def interrupted(data: Path, output: Path, fault: str) -> tuple[int, str, Path]:
+def interrupted(data: Path, output: Path, fault: str, imports: str) -> tuple[int, str, Path]:
     """Train 30 steps with a checkpoint after every 10 in a process that meets a fault: its end, and its checkpoints."""
     done = subprocess.run(
-        [sys.executable, "-c", TRAIN, data, output, fault], capture_output=True, text=True, timeout=300, env=os.environ
+        [sys.executable, "-c", imports + TRAIN, data, output, fault],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ,
     )
     return done.returncode, done.stderr, next(output.glob("*/*/*/nerfstudio_models"))
 
 
-def resumed(data: Path, output: Path, checkpoints: Path) -> int:
-    """The step at which a run that resumes goes on."""
-    config = configure("ssa-splatfacto", data, output, 30, {"num_downscales": 0})
-    config.load_dir = checkpoints
-    steps: list[int] = []
-    _, _, path = train_and_evaluate(config, steps.append)
-    assert torch.load(path.parent / "nerfstudio_models" / "step-000000029.ckpt")["step"] == 29
-    return steps[0] - 1
+@pytest.fixture(scope="session")
+def resumed(configure_training, train_and_evaluate):
+    def resumed(data: Path, output: Path, checkpoints: Path) -> int:
+        """The step at which a run that resumes goes on."""
+        config = configure_training("ssa-splatfacto", data, output, 30, {"num_downscales": 0})
+        config.load_dir = checkpoints
+        steps: list[int] = []
+        _, _, path = train_and_evaluate(config, steps.append)
+        assert torch.load(path.parent / "nerfstudio_models" / "step-000000029.ckpt")["step"] == 29
+        return steps[0] - 1
+
+    return resumed
 
 
 @pytest.mark.parametrize(
     ("fault", "code", "saved"),
     [("killed in training", -signal.SIGKILL, 10), ("killed in saving", -signal.SIGKILL, 10), ("disk full", 3, 10)],
 )
-def test_a_fault_costs_at_most_one_checkpoint_interval(tiny_scene, tmp_path, fault, code, saved):
-    ended, errors, checkpoints = interrupted(tiny_scene, tmp_path / "first", fault)
+def test_a_fault_costs_at_most_one_checkpoint_interval(
+    tiny_scene, tmp_path, fault, code, saved, resumed, training_imports
+):
+    ended, errors, checkpoints = interrupted(tiny_scene, tmp_path / "first", fault, training_imports)
     assert ended == code, errors
     assert [path.name for path in checkpoints.iterdir()] == [f"step-{saved:09d}.ckpt"]
     assert (checkpoints.parent / PARTIAL).exists() == (fault == "killed in saving")
@@ -80,9 +88,11 @@ def test_a_fault_costs_at_most_one_checkpoint_interval(tiny_scene, tmp_path, fau
 
 
 @pytest.fixture(scope="module")
-def three_checkpoints(tiny_scene, tmp_path_factory) -> Path:
+def three_checkpoints(tiny_scene, tmp_path_factory, configure_training, train_and_evaluate) -> Path:
     """A run of 30 steps that keeps every checkpoint: of steps 10, 20 and 29."""
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path_factory.mktemp("whole"), 30, {"num_downscales": 0})
+    config = configure_training(
+        "ssa-splatfacto", tiny_scene, tmp_path_factory.mktemp("whole"), 30, {"num_downscales": 0}
+    )
     config.steps_per_save, config.save_only_latest_checkpoint = 10, False
     _, _, path = train_and_evaluate(config)
     return path.parent / "nerfstudio_models"
@@ -123,7 +133,7 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_newest_checkpoint_is_passed_over_and_the_next_is_named(
-    tiny_scene, three_checkpoints, tmp_path, capsys, damage
+    tiny_scene, three_checkpoints, tmp_path, capsys, damage, resumed
 ):
     newest, next_newest, _ = copied(three_checkpoints, tmp_path / "copy")
     DAMAGES[damage](newest)
@@ -133,7 +143,9 @@ def test_a_damaged_newest_checkpoint_is_passed_over_and_the_next_is_named(
     assert f"resuming from {next_newest}, the newest checkpoint that is whole" in warnings[1]
 
 
-def test_where_every_checkpoint_is_damaged_the_folder_is_named(tiny_scene, three_checkpoints, tmp_path, capsys):
+def test_where_every_checkpoint_is_damaged_the_folder_is_named(
+    tiny_scene, three_checkpoints, tmp_path, capsys, resumed
+):
     for path in copied(three_checkpoints, tmp_path / "copy"):
         torn(path)
     with pytest.raises(InputError):
@@ -148,8 +160,8 @@ def test_strangers_in_the_folder_do_not_matter(tiny_scene, three_checkpoints, tm
     assert newest_first(tmp_path / "copy")[0].name == "step-000000029.ckpt"
 
 
-def test_only_the_latest_is_kept_and_only_once_it_is_there(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0})
+def test_only_the_latest_is_kept_and_only_once_it_is_there(tiny_scene, tmp_path, configure_training):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0})
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()

@@ -16,7 +16,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
 from benchmarks.guards import Training
 from ssa_nerfstudio.errors import TrainingError
-from ssa_nerfstudio.experiments.runs.training_run import configure
 from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.trainer import SSATrainer, machine
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam
@@ -33,19 +32,25 @@ from ssa_nerfstudio.plugin.training.nonfinite import (
 OVERLAYS = pytest.mark.parametrize("overlay", ["on", "off"])
 
 
-def make(data, output, steps: int = 4, method: str = "ssa-splatfacto", **settings) -> SSATrainer:
-    """A trainer that has been set up and has not begun; settings of the trainer and of the model."""
-    torch.manual_seed(0)
-    own = {name: settings.pop(name) for name in ("use_grad_scaler", "gradient_accumulation_steps") if name in settings}
-    config = configure(method, data, output, steps, {"num_downscales": 0, **settings})
-    for name, value in own.items():
-        setattr(config, name, value)
-    config.scale_schedules = False  # of a few steps, the densification's statistics would end at once
-    config.set_timestamp()
-    config.viewer.quit_on_train_completion = True
-    trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    return trainer
+@pytest.fixture(scope="session")
+def make(configure_training):
+    def make(data, output, steps: int = 4, method: str = "ssa-splatfacto", **settings) -> SSATrainer:
+        """A trainer that has been set up and has not begun; settings of the trainer and of the model."""
+        torch.manual_seed(0)
+        own = {
+            name: settings.pop(name) for name in ("use_grad_scaler", "gradient_accumulation_steps") if name in settings
+        }
+        config = configure_training(method, data, output, steps, {"num_downscales": 0, **settings})
+        for name, value in own.items():
+            setattr(config, name, value)
+        config.scale_schedules = False  # of a few steps, the densification's statistics would end at once
+        config.set_timestamp()
+        config.viewer.quit_on_train_completion = True
+        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        return trainer
+
+    return make
 
 
 def spoil(trainer: SSATrainer, steps: set[int] | range, what: str = "scales", value: float = math.nan) -> None:
@@ -92,7 +97,7 @@ def after_each_step(trainer: SSATrainer) -> list[dict[str, Tensor]]:
 @OVERLAYS
 @pytest.mark.parametrize("what", ["scales", "means", "loss", "overlay"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_a_step_that_is_not_finite_leaves_everything_as_it_was(tiny_scene, tmp_path, overlay, what, value):
+def test_a_step_that_is_not_finite_leaves_everything_as_it_was(tiny_scene, tmp_path, overlay, what, value, make):
     if what == "overlay" and overlay == "off":
         pytest.skip("there is no overlay whose gradient could break")
     trainer = make(tiny_scene, tmp_path, overlay=overlay)
@@ -127,7 +132,7 @@ class Operations(TorchDispatchMode):
 
 @OVERLAYS
 @pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
-def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_path, overlay, method):
+def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_path, overlay, method, make):
     """Between two looks: reading one number (`_local_scalar_dense`) would make the host wait at every step."""
     counts: dict[bool, Counter[str]] = {}
     for guards in (True, False):
@@ -148,7 +153,7 @@ def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_pa
 
 
 @OVERLAYS
-def test_without_the_guard_such_a_step_spoils_the_parameters(tiny_scene, tmp_path, overlay):
+def test_without_the_guard_such_a_step_spoils_the_parameters(tiny_scene, tmp_path, overlay, make):
     trainer = make(tiny_scene, tmp_path, overlay=overlay, guards=False)
     spoil(trainer, {2})
     states = after_each_step(trainer)
@@ -159,7 +164,7 @@ def test_without_the_guard_such_a_step_spoils_the_parameters(tiny_scene, tmp_pat
 
 
 @OVERLAYS
-def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_guard(tiny_scene, tmp_path, overlay):
+def test_the_statistics_of_a_broken_step_are_left_out_and_spoilt_without_the_guard(tiny_scene, tmp_path, overlay, make):
     sums = {}
     for guards in (True, False):
         trainer = make(tiny_scene, tmp_path / str(guards), guards=guards, overlay=overlay)
@@ -241,7 +246,7 @@ def test_the_backward_pass_begins_with_a_power_of_two_or_nothing_usable(value):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="gsplat adds gradients up in any order")
 @OVERLAYS
 @pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
-def test_a_sound_training_is_the_same_to_the_last_bit_without_guards(tiny_scene, tmp_path, overlay, method):
+def test_a_sound_training_is_the_same_to_the_last_bit_without_guards(tiny_scene, tmp_path, overlay, method, make):
     """Gradients 2^64 times as large: nothing overflows on the way back, and nothing is rounded otherwise."""
     states = {}
     for guards in (True, False):
@@ -306,7 +311,7 @@ def test_a_loss_is_scaled_and_seeded(magnified):
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_gradients_of_half_precision_are_not_magnified(tiny_scene, tmp_path, asked):
+def test_gradients_of_half_precision_are_not_magnified(tiny_scene, tmp_path, asked, make):
     trainer = make(tiny_scene, tmp_path, use_grad_scaler=asked)
     scaling = asked and torch.cuda.is_available()  # elsewhere torch's scaler says that it is off
     guard = trainer.optimizers.guard
@@ -320,7 +325,7 @@ def test_gradients_of_half_precision_are_not_magnified(tiny_scene, tmp_path, ask
 @OVERLAYS
 @pytest.mark.parametrize("what", ["quats", "means", "loss", "large"])
 def test_where_gradients_add_up_a_broken_step_is_skipped_by_those_too_that_only_gather(
-    tiny_scene, tmp_path, overlay, what
+    tiny_scene, tmp_path, overlay, what, make
 ):
     """Step 2 is one at which quaternions gather: a step of theirs is every second."""
     trainer = make(tiny_scene, tmp_path, overlay=overlay, gradient_accumulation_steps={"quats": 2})
@@ -332,7 +337,7 @@ def test_where_gradients_add_up_a_broken_step_is_skipped_by_those_too_that_only_
     assert first_not_finite(states[3]) is None
 
 
-def test_a_training_in_which_nothing_steps_at_first_is_guarded_as_well(tiny_scene, tmp_path):
+def test_a_training_in_which_nothing_steps_at_first_is_guarded_as_well(tiny_scene, tmp_path, make):
     every = dict.fromkeys(("means", "scales", "quats", "features_dc", "features_rest", "opacities", "overlay"), 2)
     states = {}
     for guards in (True, False):
@@ -345,7 +350,7 @@ def test_a_training_in_which_nothing_steps_at_first_is_guarded_as_well(tiny_scen
 
 
 @pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
-def test_counts_are_right_after_a_window_of_skips_and_refinements(tiny_scene, tmp_path, method):
+def test_counts_are_right_after_a_window_of_skips_and_refinements(tiny_scene, tmp_path, method, make):
     settings = {"refine_every": 10, "warmup_length": 5, "stop_split_at": 100, "mcmc_stop_at": 100}
     trainer = make(tiny_scene, tmp_path, steps=100, method=method, max_skipped_steps=10, **settings)
     broken = {0, 3, 4, 10, 11, 19, 20, 21, 50, 55, 97, 99}
@@ -355,7 +360,7 @@ def test_counts_are_right_after_a_window_of_skips_and_refinements(tiny_scene, tm
     assert steps == {100 - len(broken)}
 
 
-def test_a_checkpoint_between_two_looks_holds_the_steps_that_were_taken(tiny_scene, tmp_path):
+def test_a_checkpoint_between_two_looks_holds_the_steps_that_were_taken(tiny_scene, tmp_path, make):
     trainer = make(tiny_scene, tmp_path, steps=12)
     trainer.config.steps_per_save, trainer.config.save_only_latest_checkpoint = 7, False
     spoil(trainer, {3, 5, 10}, "scales")
@@ -367,9 +372,9 @@ def test_a_checkpoint_between_two_looks_holds_the_steps_that_were_taken(tiny_sce
     assert counts == {7: {6}, 11: {9}}
 
 
-def test_optimizers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_path):
+def test_optimizers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_path, configure_training):
     torch.manual_seed(0)
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0})
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 4, {"num_downscales": 0})
     for entry in config.optimizers.values():
         entry["optimizer"] = AdamOptimizerConfig(lr=entry["optimizer"].lr, eps=1e-15)
     config.set_timestamp()
@@ -383,7 +388,7 @@ def test_optimizers_that_are_not_fused_skip_in_a_training_too(tiny_scene, tmp_pa
 
 
 @pytest.mark.parametrize("group", ["camera_opt", "bilateral_grid"])
-def test_cameras_and_bilateral_grids_skip_with_the_rest(tiny_scene, tmp_path, group):
+def test_cameras_and_bilateral_grids_skip_with_the_rest(tiny_scene, tmp_path, group, make):
     from nerfstudio.cameras.camera_optimizers import CameraOptimizerConfig
 
     trainer = make(tiny_scene, tmp_path, camera_optimizer=CameraOptimizerConfig(mode="SO3xR3"), use_bilateral_grid=True)
@@ -394,7 +399,9 @@ def test_cameras_and_bilateral_grids_skip_with_the_rest(tiny_scene, tmp_path, gr
 
 
 @OVERLAYS
-def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny_scene, tmp_path, capsys, overlay):
+def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(
+    tiny_scene, tmp_path, capsys, overlay, make
+):
     trainer = make(tiny_scene, tmp_path, steps=110, overlay=overlay, max_skipped_steps=20, stop_split_at=1)
     spoil(trainer, range(40, 110), "opacities")
     with pytest.raises(TrainingError):
@@ -405,7 +412,7 @@ def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny
     assert "the gradient of opacities was not finite" in line
 
 
-def test_skipped_steps_that_are_not_in_a_row_are_told_and_endured(tiny_scene, tmp_path, capsys):
+def test_skipped_steps_that_are_not_in_a_row_are_told_and_endured(tiny_scene, tmp_path, capsys, make):
     trainer = make(tiny_scene, tmp_path, steps=200, max_skipped_steps=3, stop_split_at=1)
     spoil(trainer, set(range(0, 200, 3)) | set(range(2, 200, 3)), "quats")
     trainer.train()
@@ -462,7 +469,7 @@ def test_the_culprit_is_the_parameter_whose_value_broke():
 
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
-def test_log_scales_stay_in_range(tiny_scene, tmp_path, overlay, guards):
+def test_log_scales_stay_in_range(tiny_scene, tmp_path, overlay, guards, make):
     trainer = make(tiny_scene, tmp_path, steps=RANGE_EVERY + 1, overlay=overlay, guards=guards)
     with torch.no_grad():
         trainer.pipeline.model.scales[0], trainer.pipeline.model.scales[1] = -40.0, 30.0
@@ -525,7 +532,7 @@ def test_a_matte_at_either_end_comes_back_and_without_the_range_it_does_not(sign
 
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
-def test_the_cap_holds_in_a_training_and_a_given_overlay_has_none(tiny_scene, tmp_path, overlay, guards):
+def test_the_cap_holds_in_a_training_and_a_given_overlay_has_none(tiny_scene, tmp_path, overlay, guards, make):
     trainer = make(tiny_scene, tmp_path, steps=RANGE_EVERY + 1, overlay=overlay, guards=guards)
     learned = trainer.pipeline.model.artifacts.learned()
     with torch.no_grad():
@@ -539,7 +546,7 @@ def test_the_cap_holds_in_a_training_and_a_given_overlay_has_none(tiny_scene, tm
 
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
-def test_start_points_inside_a_camera_are_left_out(tiny_scene, tmp_path, overlay, guards):
+def test_start_points_inside_a_camera_are_left_out(tiny_scene, tmp_path, overlay, guards, make):
     count = len(make(tiny_scene, tmp_path / "a", overlay=overlay).pipeline.model.means)
     from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 
@@ -560,7 +567,7 @@ def test_start_points_inside_a_camera_are_left_out(tiny_scene, tmp_path, overlay
 
 
 @OVERLAYS
-def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tmp_path, capsys, overlay):
+def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tmp_path, capsys, overlay, make):
     trainer = make(tiny_scene, tmp_path, overlay=overlay)
     trainer.save_checkpoint(0)
     with torch.no_grad():
@@ -573,7 +580,7 @@ def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tm
 
 @OVERLAYS
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys, overlay, value):
+def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, capsys, overlay, value, make):
     trainer = make(tiny_scene, tmp_path, steps=2, overlay=overlay)
     trainer.train()
     means = trainer.optimizers.optimizers["means"]
