@@ -21,7 +21,7 @@ from ssa_nerfstudio.evidence.poisson import divergence, integrated
 BACKGROUND_SCALE = 2.0
 """Working pixels (sigma): gradients that vary this slowly along static edges are the scene's, and are subtracted."""
 LEAST_MATTE = 0.1
-"""An estimated matte from which on an artifact is at work. Constant start's matte, too (`layer.CONSTANT_START`)."""
+"""An estimated matte from which on an artifact is at work; that of the constant initialization."""
 LEAST_DIFFERENCE = 10 / 255
 """Difference in color from which on an artifact is at work."""
 REACH = 32

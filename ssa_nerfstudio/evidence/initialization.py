@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.static_area import StaticArea
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
-from ssa_nerfstudio.overlay.layer import CONSTANT_START, MATTE_START_RANGE, ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import CONSTANT_INITIALIZATION, INITIAL_MATTE_RANGE, ScreenSpaceOverlay
 
 STATISTICS_SCALE = 0.05
 """s of the paper: a pixel whose standard deviation over the views is s starts with a matte of 1 / e."""
@@ -45,7 +45,7 @@ def initialize(overlay: ScreenSpaceOverlay, statistics: ImageStatistics, area: S
         hidden = torch.zeros_like(hidden)
     layers = torch.cat([alpha, addition, deviation, opaque, hidden, near], dim=-1)
     alpha, addition, deviation, opaque, hidden, near = _reduced(layers, overlay).split((1, 3, 1, 1, 1, 1), dim=-1)
-    color = addition.clamp_min(MATTE_START_RANGE[0]) if overlay.adds_light else addition / alpha
+    color = addition.clamp_min(INITIAL_MATTE_RANGE[0]) if overlay.adds_light else addition / alpha
     overlay.initialize(color, alpha, torch.minimum(_evidence(deviation, opaque), 1 - hidden), near > 0)
 
 
@@ -54,9 +54,9 @@ def _layers(statistics: ImageStatistics, area: StaticArea, adds_light: bool) -> 
     mean, deviation = statistics.mean(), statistics.deviation()
     opaque, near = (mask.to(mean.device)[..., None] for mask in (area.opaque, area.near))
     matte, difference = area.matte.to(mean)[..., None], area.difference.to(mean)
-    floor = torch.where(near, CONSTANT_START[1], MATTE_START_RANGE[0])
+    floor = torch.where(near, CONSTANT_INITIALIZATION[1], INITIAL_MATTE_RANGE[0])
     if adds_light:
-        matte, floor = torch.zeros_like(matte), MATTE_START_RANGE[0]
+        matte, floor = torch.zeros_like(matte), INITIAL_MATTE_RANGE[0]
     # The matte, not the transmittance, in float64: in float32 one minus exp(-20), where no two views show the pixel,
     # is 1, and its mean color would be lost.
     alpha = torch.where(opaque, torch.exp(-deviation / STATISTICS_SCALE), matte.clamp_min(floor))

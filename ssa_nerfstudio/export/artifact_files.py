@@ -14,7 +14,7 @@ import torch
 from ssa_nerfstudio import __version__
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 from ssa_nerfstudio.export.checkpoint import Checkpoint
-from ssa_nerfstudio.overlay.pictures import over_checkerboard
+from ssa_nerfstudio.overlay.rgba import over_checkerboard
 
 FILES = {
     "overlay.png": "RGBA, 8 bits, straight alpha, sRGB as the photos",

@@ -1,6 +1,6 @@
-"""The picture that a photo shows of a render and the artifact in front of it.
+"""Compositing: the image that a camera records of a render and the artifact in front of it.
 
-Source: the paper, equation "composition"; that the matte sees splats only is ours (docs/method.md).
+Source: the paper, equation "composition". The matte's gradient over splats alone is ours (docs/method.md).
 """
 
 from __future__ import annotations
@@ -13,12 +13,15 @@ from ssa_nerfstudio.overlay.resampling import straight_color
 
 
 def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
-    """Put an artifact in front of a render: I = T C + B (equation "composition" with T = 1 - A, B = A W).
+    """Composite an artifact over a render: I = T C + B (equation "composition" with T = 1 - A, B = A W).
 
     Args:
-        clean: [H, W, 3] in [0, 1].
-        transmittance: [H, W, 1] or [H, W, 3] in [0, 1].
-        addition: [H, W, 3], not negative.
+        clean: C [H, W, 3] in [0, 1].
+        transmittance: T [H, W, 1] or [H, W, 3] in [0, 1].
+        addition: B [H, W, 3], not negative.
+
+    Returns:
+        I [H, W, 3].
     """
     return transmittance * clean + addition
 
@@ -26,18 +29,18 @@ def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
 def composite_over_splats(
     clean: Tensor, accumulation: Tensor, background: Tensor, transmittance: Tensor, addition: Tensor
 ) -> Tensor:
-    """`composite`, with a gradient of the matte that sees splats only: an overlay gains nothing by hiding background.
+    """`composite` with a gradient that does not reward the matte for hiding background.
 
     Where no splat covers a pixel, the render shows the background color (in splatfacto a random one at every step).
     Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
-    Here the matte is judged as if the overlay's own color stood behind the splats: there, nothing is gained, sparsity
-    takes the overlay back, and the scene has to fill the hole.
+    Here the matte's gradient is taken as if the overlay's own color stood behind the splats: hiding background gains
+    nothing, sparsity removes the overlay there, and the scene has to fill the hole.
 
     Args:
-        clean: [H, W, 3], the render with its background.
-        accumulation: [H, W, 1], opacity of the splats.
-        background: [3], the color behind them.
-        transmittance, addition: [H, W, 1] and [H, W, 3] in [0, 1].
+        clean: C [H, W, 3], the render with its background.
+        accumulation: opacity of the splats [H, W, 1] in [0, 1].
+        background: the color behind them [3].
+        transmittance, addition: T [H, W, 1] and B [H, W, 3] in [0, 1].
 
     Returns:
         [H, W, 3], the same values as `composite`.
@@ -48,29 +51,35 @@ def composite_over_splats(
     return _OverSplats.apply(clean, transmittance, addition, over_color)  # pyright: ignore[reportReturnType]
 
 
-def paint(
+def composite_logits(
     clean: Tensor, color_logits: Tensor, alpha_logits: Tensor, behind: tuple[Tensor, Tensor] | None = None
 ) -> Tensor:
-    """`composite` of an artifact that hides, straight from its logits: I = (1 - A) C + A W.
+    """`composite` of a matte and a color given as logits: I = (1 - A) C + A W.
 
-    A step waits for launches of kernels; value and gradient are by hand, in 13 of them instead of 35.
+    Value and gradient are by hand, in 13 kernel launches instead of autograd's 35: a step waits for its launches.
 
     Args:
-        clean: [H, W, 3], the render with its background.
+        clean: C [H, W, 3], the render with its background.
         color_logits, alpha_logits: W~ [H, W, 3] and A~ [H, W, 1].
-        behind: opacity of the splats [H, W, 1] and color of the background [3]: the gradient of the matte is that of
-            `composite_over_splats`; None: that of the picture.
+        behind: opacity of the splats [H, W, 1] and color of the background [3] for the matte's gradient of
+            `composite_over_splats`; None for the gradient of plain compositing.
+
+    Returns:
+        I [H, W, 3].
     """
-    return _Painted.apply(clean, color_logits, alpha_logits, *(behind or (None, None)))  # pyright: ignore[reportReturnType]
+    return _CompositeLogits.apply(clean, color_logits, alpha_logits, *(behind or (None, None)))  # pyright: ignore[reportReturnType]
 
 
-def clipped(picture: Tensor) -> Tensor:
-    """What a photo records of I = T C + B: [0, 1]. Its gradient is that of the identity."""
-    return _Clipped.apply(picture)  # pyright: ignore[reportReturnType]
+def clip_straight_through(image: Tensor) -> Tensor:
+    """Clip I = T C + B to [0, 1], as a photo does, with the gradient of the identity.
+
+    A prediction beyond white has to be pulled back; the gradient of a plain clamp is zero there.
+    """
+    return _ClipStraightThrough.apply(image)  # pyright: ignore[reportReturnType]
 
 
 class _OverSplats(torch.autograd.Function):
-    """T C + B, whose gradient of T is taken at another render. By hand: a step waits for the host, not for the GPU."""
+    """T C + B with the gradient of T taken at another render."""
 
     @staticmethod
     def forward(ctx, clean: Tensor, transmittance: Tensor, addition: Tensor, over_color: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -84,8 +93,8 @@ class _OverSplats(torch.autograd.Function):
         return v * transmittance, (v * over_color).sum(dim=-1, keepdim=True), v, None
 
 
-class _Painted(torch.autograd.Function):
-    """(1 - A) C + A W of the logits of A and W."""
+class _CompositeLogits(torch.autograd.Function):
+    """(1 - A) C + A W as a function of the logits of A and W."""
 
     @staticmethod
     def forward(  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -107,18 +116,16 @@ class _Painted(torch.autograd.Function):
         hidden = clean
         if accumulation is not None:
             hidden = torch.addcmul(clean, 1.0 - accumulation, color - background)
-        painted = v * alpha
-        by_alpha = ((color - hidden) * v).sum(dim=-1, keepdim=True)
+        v_color = v * alpha
+        v_alpha = ((color - hidden) * v).sum(dim=-1, keepdim=True)
         sigmoid = torch.ops.aten.sigmoid_backward
-        return v - painted, sigmoid(painted, color), sigmoid(by_alpha, alpha), None, None
+        return v - v_color, sigmoid(v_color, color), sigmoid(v_alpha, alpha), None, None
 
 
-class _Clipped(torch.autograd.Function):
-    """Clip to [0, 1]; the gradient passes. A prediction beyond white is to be brought back, not left alone."""
-
+class _ClipStraightThrough(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, picture: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
-        return picture.clamp(0.0, 1.0)
+    def forward(ctx, image: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return image.clamp(0.0, 1.0)
 
     @staticmethod
     def backward(ctx, v: Tensor) -> Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]

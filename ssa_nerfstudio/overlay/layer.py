@@ -1,6 +1,6 @@
-"""The artifact as a picture in front of every view: what is learned of it, its start, its layers.
+"""The overlay as a torch module: learned (`ScreenSpaceOverlay`), or known (`OracleOverlay`).
 
-Source: the paper, section "Modeling screen-space artifacts"; light that hides nothing is ours.
+Source: the paper, section "Modeling screen-space artifacts"; additive light is ours.
 """
 
 from __future__ import annotations
@@ -10,47 +10,51 @@ import math
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats, paint
-from ssa_nerfstudio.overlay.resampling import letterbox, reduced_size, stack_premultiplied, to_training_scale
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.overlay.compositing import composite, composite_logits, composite_over_splats
+from ssa_nerfstudio.overlay.resampling import letterbox, premultiply, reduced_size, to_training_scale
 
-CONSTANT_START = (0.5, 0.1)
-"""Color and matte of the paper's ablation "constant start"."""
-MATTE_START_RANGE = (0.01, 0.99)
-"""The starting matte is clamped to this before the logit: exp(-sigma / s) is exactly 1 where sigma is 0."""
+CONSTANT_INITIALIZATION = (0.5, 0.1)
+"""Initial color and matte of the paper's ablation "constant start"."""
+INITIAL_MATTE_RANGE = (0.01, 0.99)
+"""The initial matte is clamped to this before the logit: exp(-sigma / s) is exactly 1 where sigma is 0."""
+INITIAL_COLOR_RANGE = (1 / 510, 1 - 1 / 510)
+"""The initial color is clamped to this before the logit: half a gray level from black and white."""
 MATTE_LOGIT_RANGE = (-12.0, math.log(0.999 / 0.001))
-"""While it learns, the matte stays between 6e-6 and 0.999: beyond, the sigmoid is flat and a pixel never comes back,
-and the scene behind an opaque pixel would lose all gradient. 0.999 is 255 in a file of 8 bits, and gsplat's largest
-alpha of one Gaussian. A given artifact has no such range."""
+"""Range of the learned matte's logits: 6e-6 to 0.999. Beyond it the sigmoid is flat, a pixel never recovers, and the
+scene behind an opaque pixel loses all gradient. 0.999 is 255 in 8 bits, and gsplat's maximal alpha of one Gaussian. An
+oracle overlay has no such range."""
 COLOR_LOGIT_RANGE = (-12.0, 12.0)
-"""While it learns, the color stays between 6e-6 and 1 - 6e-6, for the same reason."""
-COLOR_START_RANGE = (1 / 510, 1 - 1 / 510)
-"""The starting color is clamped to this before the logit: half a gray level from black and white."""
+"""Range of the learned color's logits: 6e-6 to 1 - 6e-6, for the same reason."""
 
 
 class ScreenSpaceOverlay(nn.Module):
     """A learnable RGBA image shared by all views of one camera: W = sigmoid(W~), A = sigmoid(A~), one per pixel.
 
-    T = 1 - A and B = A W (paper); or, for an artifact that adds light, B = W, whatever A is.
+    T = 1 - A and B = A W (paper). For an artifact that adds light, B = W independent of A.
     """
 
     frame: Tensor
+    """[4] int64: height, width, resolution, adds_light. A checkpoint tells its overlay's size by it, before any photo
+    has been opened."""
     evidence: Tensor
+    """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the views agree."""
     near: Tensor
+    """[h, w, 1], 1 at pixels that learn from the first step, 0 at those that `hold_far_pixels` holds."""
 
     def __init__(self, height: int, width: int, resolution: int = 1, adds_light: bool = False) -> None:
-        """Make an overlay for a frame, with the paper's constant start.
+        """Create an overlay with constant color and matte.
 
         Args:
-            height, width: the camera's frame in pixels (undistorted).
+            height, width: of the camera's undistorted frame, pixels.
             resolution: 1, 2 or 4: the overlay holds one pixel for a block of this side.
-            adds_light: what it adds does not depend on what it hides.
+            adds_light: B is learned independently of A.
         """
         super().__init__()
         size = reduced_size(height, width, resolution)
-        color, alpha = CONSTANT_START
+        color, alpha = CONSTANT_INITIALIZATION
         self.color_logits = nn.Parameter(torch.full((*size, 3), color).logit())
         self.alpha_logits = nn.Parameter(torch.full((*size, 1), alpha).logit())
-        # Lets a checkpoint say how large its overlay is, before any photo has been opened.
         self.register_buffer("frame", torch.tensor([height, width, resolution, int(adds_light)]))
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.register_buffer("near", torch.ones(*size, 1))
@@ -59,85 +63,94 @@ class ScreenSpaceOverlay(nn.Module):
 
     @torch.no_grad()
     def initialize(self, color: Tensor, alpha: Tensor, evidence: Tensor, near: Tensor) -> None:
-        """Start from given layers of the overlay's own size; both are clamped so that their logits are finite.
+        """Set the parameters and buffers; color and matte are clamped so that their logits are finite.
 
         Args:
-            color: W, straight color or the light that is added, [h, w, 3] in [0, 1].
+            color: W, straight color or additive light, [h, w, 3] in [0, 1].
             alpha: A, [h, w, 1] in [0, 1].
-            evidence: r, [h, w, 1] in [0, 1], weight of the sparsity term.
-            near: [h, w, 1] bool, pixels that learn from the first step (`hold_far_pixels`).
+            evidence: r, [h, w, 1] in [0, 1], weight of the sparsity loss.
+            near: [h, w, 1] bool, pixels that learn from the first step.
         """
-        self.color_logits.copy_(color.clamp(*COLOR_START_RANGE).logit())
-        self.alpha_logits.copy_(alpha.clamp(*MATTE_START_RANGE).logit())
+        self.color_logits.copy_(color.clamp(*INITIAL_COLOR_RANGE).logit())
+        self.alpha_logits.copy_(alpha.clamp(*INITIAL_MATTE_RANGE).logit())
         self.evidence.copy_(evidence)
         self.near.copy_(near)
 
     @torch.no_grad()
-    def wait_for_the_scene(self, waiting: bool) -> None:
-        """Hold what is far from static edges as it is, from the first step for which this is said to the last.
+    def hold_far_pixels(self, active: bool) -> None:
+        """Hold, or release, the pixels far from static edges; call it before every optimizer step.
 
         Early in a training an overlay explains anything constant (the sky ahead of a walk) sooner than Gaussians can.
-        What the scene has learned by itself when the wait is over, the overlay gains nothing by taking.
+        Once the scene has learned it, the overlay has nothing to gain there.
+
+        Args:
+            active: the first call with True remembers the parameters that `restore_held` restores; False releases them.
         """
-        if not waiting:
+        if not active:
             self._held = []
         elif not self._held:
             self._held = [(p.clone(), (self.near > 0).expand_as(p)) for p in self.parameters()]
 
     @torch.no_grad()
-    def take_back(self) -> None:
-        """After a step: undo it where the overlay waits; where it does not, nothing is held.
+    def restore_held(self) -> None:
+        """Undo an optimizer step at the pixels that are held.
 
-        Rather than to let no gradient through: Adam would not know its size when the wait is over, and start with steps
-        six times too large.
+        Zero gradients would not do: Adam's second moment would be zero on release, and its first steps six times too
+        large.
         """
         for parameter, (held, near) in zip(self.parameters(), self._held, strict=False):
             torch.where(near, parameter, held, out=parameter)
 
     @torch.no_grad()
-    def keep_in_range(self) -> None:
-        """Clamp the parameters to where a gradient can still move them (`MATTE_LOGIT_RANGE`, `COLOR_LOGIT_RANGE`)."""
+    def clamp_logits(self) -> None:
+        """Clamp the parameters to MATTE_LOGIT_RANGE and COLOR_LOGIT_RANGE, where a gradient can still move them."""
         self.alpha_logits.clamp_(*MATTE_LOGIT_RANGE)
         self.color_logits.clamp_(*COLOR_LOGIT_RANGE)
 
     def color(self) -> Tensor:
-        """W: straight color, or the light that is added, [h, w, 3] in (0, 1)."""
+        """W: straight color, or additive light, [h, w, 3] in (0, 1)."""
         return torch.sigmoid(self.color_logits)
 
     def matte(self) -> Tensor:
-        """A: opacity [h, w, 1] in (0, 1)."""
+        """A [h, w, 1] in (0, 1)."""
         return torch.sigmoid(self.alpha_logits)
 
     def opacity(self) -> Tensor:
-        """What sparsity weighs, [h, w, 1]: A; of an artifact that adds light the largest of A and B."""
+        """The argument of the sparsity loss [h, w, 1] in (0, 1): A, or for additive light the maximum of A and B."""
         if self.adds_light:
             return torch.sigmoid(torch.maximum(self.alpha_logits, self.color_logits.amax(dim=-1, keepdim=True)))
         return self.matte()
 
-    def in_front_of(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
-        """What a photo shows of a render: I = T C + B.
+    def composite(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """Composite the overlay over a render: I = T C + B.
 
         Args:
-            clean: [H // reduction, W // reduction, 3], the render with its background.
-            reduction: 1, 2 or 4: training images are reduced by this.
-            behind: opacity of the splats [..., 1] and color of the background [3], which the matte then gains nothing
-                by hiding (`composite_over_splats`); None: plain compositing.
+            clean: C [H // reduction, W // reduction, 3], the render with its background.
+            reduction: 1, 2 or 4: factor by which training images are reduced.
+            behind: opacity of the splats [H // reduction, W // reduction, 1] and color of the background [3], for the
+                matte's gradient of `composite_over_splats`; None for plain compositing.
+
+        Returns:
+            I, of the render's shape; not clipped.
         """
         if self.resolution == reduction == 1 and not self.adds_light:
-            return paint(clean, self.color_logits, self.alpha_logits, behind)
+            return composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         layers = self.layers(reduction)
         return composite(clean, *layers) if behind is None else composite_over_splats(clean, *behind, *layers)
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
-        """Transmittance [H // reduction, W // reduction, 1] and added light [..., 3], averaged premultiplied.
+        """Resample the overlay to training images, averaged premultiplied.
 
         Args:
-            reduction: 1, 2 or 4: training images are reduced by this.
+            reduction: 1, 2 or 4: factor by which training images are reduced.
+
+        Returns:
+            Transmittance T [H // reduction, W // reduction, 1] and addition B [H // reduction, W // reduction, 3].
         """
         if self.adds_light:
             transmittance, addition = 1.0 - self.matte(), self.color()
         else:
-            transmittance, addition = stack_premultiplied(self.color(), self.matte())
+            transmittance, addition = premultiply(self.color(), self.matte())
         if self.resolution == reduction == 1:
             return transmittance, addition
         pair = torch.cat([transmittance, addition], dim=-1)
@@ -145,34 +158,39 @@ class ScreenSpaceOverlay(nn.Module):
         return pair[..., :1], pair[..., 1:]
 
 
-class GivenOverlay(nn.Module):
-    """The true artifact, known and not learned: I = clip(T C + B), T per channel. The reference of every benchmark."""
+class OracleOverlay(nn.Module):
+    """The true artifact, known and not learned: I = clip(T C + B), T per channel. The reference of a benchmark."""
 
     frame: Tensor
+    """[4] int64: height, width, 1, 0; as that of `ScreenSpaceOverlay`."""
     transmittance: Tensor
     addition: Tensor
 
     def __init__(self, transmittance: Tensor, addition: Tensor) -> None:
-        """Take T and B [H, W, 3] of the undistorted frame.
+        """Store the layers.
+
+        Args:
+            transmittance: T [H, W, 3] of the undistorted frame, in [0, 1].
+            addition: B [H, W, 3].
 
         Raises:
-            ValueError: for shapes other than [H, W, 3], values that are not finite, or T outside [0, 1].
+            InputError: a shape other than [H, W, 3], values that are not finite, or T outside [0, 1].
         """
         super().__init__()
         if transmittance.dim() != 3 or transmittance.shape[2] != 3 or transmittance.shape != addition.shape:
             shapes = tuple(transmittance.shape), tuple(addition.shape)
-            raise ValueError(f"T and B must both be [H, W, 3], they are {shapes[0]} and {shapes[1]}")
+            raise InputError(f"T and B must both be [H, W, 3], they are {shapes[0]} and {shapes[1]}")
         if not (torch.isfinite(transmittance).all() and torch.isfinite(addition).all()):
-            raise ValueError("T or B holds values that are not finite")
+            raise InputError("T or B holds values that are not finite")
         if transmittance.min() < 0 or transmittance.max() > 1:
-            raise ValueError("T must lie in [0, 1]")
+            raise InputError("T must lie in [0, 1]")
         self.register_buffer("transmittance", transmittance.float())
         self.register_buffer("addition", addition.float())
         self.height, self.width = transmittance.shape[:2]
         self.register_buffer("frame", torch.tensor([self.height, self.width, 1, 0]))
 
-    def in_front_of(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
-        """As `ScreenSpaceOverlay.in_front_of`; there is no matte that could gain anything."""
+    def composite(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
+        """As `ScreenSpaceOverlay.composite`; without a learned matte, `behind` makes no difference."""
         return composite(clean, *self.layers(reduction))
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
@@ -183,7 +201,11 @@ class GivenOverlay(nn.Module):
         )
 
 
-def fitted(overlay: ScreenSpaceOverlay | GivenOverlay, height: int, width: int) -> tuple[Tensor, Tensor]:
-    """An overlay's layers in a frame of any size and aspect: scaled, centered, never stretched; clear around it."""
+def letterboxed_layers(overlay: ScreenSpaceOverlay | OracleOverlay, height: int, width: int) -> tuple[Tensor, Tensor]:
+    """Fit an overlay's layers into a frame of any size and aspect: scaled without stretching, centered.
+
+    Returns:
+        Transmittance [height, width, 1 or 3], 1 around the overlay, and addition [height, width, 3], 0 around it.
+    """
     transmittance, addition = overlay.layers()
     return letterbox(transmittance, height, width, 1.0), letterbox(addition, height, width, 0.0)

@@ -1,7 +1,7 @@
 """Resampling of premultiplied layers [H, W, C], pixel-aligned with the way training images are reduced.
 
 Straight colors must not be averaged: a transparent pixel's color means nothing and would bleed into its neighbors.
-What is averaged here is always the pair (transmittance, added light), in which compositing is linear.
+The pair (transmittance, addition) is averaged instead, in which compositing is linear.
 """
 
 from __future__ import annotations
@@ -12,9 +12,14 @@ from torch import Tensor
 
 
 def box_reduce(layer: Tensor, factor: int) -> Tensor:
-    """Average blocks of factor x factor pixels; rows and columns that fill no block are dropped.
+    """Average blocks of factor x factor pixels, the filter by which `splatfacto.resize_image` reduces the photos.
 
-    The same filter as `splatfacto.resize_image`, which reduces the photos: [H, W, C] to [H // factor, W // factor, C].
+    Args:
+        layer: [H, W, C].
+        factor: side of a block, pixels.
+
+    Returns:
+        [H // factor, W // factor, C]; rows and columns that fill no block are dropped.
     """
     if factor == 1:
         return layer
@@ -24,7 +29,7 @@ def box_reduce(layer: Tensor, factor: int) -> Tensor:
 
 
 def enlarge(layer: Tensor, factor: int, height: int, width: int) -> Tensor:
-    """Enlarge bilinearly by a whole factor and crop to [height, width, C]; pixel (0, 0) keeps its corner."""
+    """Upsample [h, w, C] bilinearly by an integer factor and crop to [height, width, C] at the upper left corner."""
     if factor > 1:
         planes = F.interpolate(layer.permute(2, 0, 1)[None], scale_factor=float(factor), mode="bilinear")
         layer = planes[0].permute(1, 2, 0)
@@ -32,11 +37,12 @@ def enlarge(layer: Tensor, factor: int, height: int, width: int) -> Tensor:
 
 
 def letterbox(layer: Tensor, height: int, width: int, fill: float) -> Tensor:
-    """Fit a layer into a frame of any size and aspect: scaled without stretching, centered, `fill` around it.
+    """Fit a layer into a frame of any size and aspect: scaled without stretching, centered.
 
     Args:
         layer: [H, W, C].
-        fill: value of the bars: 1 for a transmittance, 0 for added light.
+        height, width: of the frame, pixels.
+        fill: value of the bars: 1 for a transmittance, 0 for an addition.
 
     Returns:
         [height, width, C].
@@ -53,12 +59,12 @@ def letterbox(layer: Tensor, height: int, width: int, fill: float) -> Tensor:
 
 
 def reduced_size(height: int, width: int, factor: int) -> tuple[int, int]:
-    """Size of an overlay that holds one pixel for each started block of factor x factor pixels of its frame."""
+    """Size of an overlay with one pixel for each block, whole or partial, of factor x factor pixels of its frame."""
     return -(-height // factor), -(-width // factor)
 
 
 def to_training_scale(layer: Tensor, resolution: int, reduction: int, height: int, width: int) -> Tensor:
-    """Bring an overlay of 1 / `resolution` of the frame to a training image of 1 / `reduction` of the frame.
+    """Resample an overlay at 1 / `resolution` of the frame to a training image at 1 / `reduction` of the frame.
 
     Args:
         layer: [ceil(H / resolution), ceil(W / resolution), C] of a frame [H, W].
@@ -74,16 +80,22 @@ def to_training_scale(layer: Tensor, resolution: int, reduction: int, height: in
     return enlarge(layer, resolution // reduction, *target)
 
 
-def stack_premultiplied(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Straight color [..., 3] and matte [..., 1] as (transmittance [..., 1], added light [..., 3])."""
+def premultiply(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
+    """Convert straight color [..., 3] and matte [..., 1] to transmittance [..., 1] and addition [..., 3]."""
     return 1.0 - alpha, alpha * color
 
 
 def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Tensor]:
-    """Undo `stack_premultiplied`: (color [..., 3], matte [..., 1]); black where the matte is zero.
+    """Convert layers to straight color and matte, the inverse of `premultiply`.
 
-    The transmittance may have one channel or three; the matte is one minus its mean. Light that hides nothing has no
-    straight color: it gets the least matte that can carry it, at most 1.
+    Additive light has no straight color: it gets the smallest matte that can carry it, at most 1.
+
+    Args:
+        transmittance: T [..., 1] or [..., 3] in [0, 1]; the matte is one minus its mean.
+        addition: B [..., 3], not negative.
+
+    Returns:
+        Color [..., 3] in [0, 1], black where the matte is zero, and matte [..., 1] in [0, 1].
     """
     alpha = torch.maximum(1.0 - transmittance.mean(dim=-1, keepdim=True), addition.amax(dim=-1, keepdim=True))
     alpha = alpha.clamp_max(1.0)

@@ -11,11 +11,11 @@ from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
+from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES, find_frame, match_camera, nearest_aspect
 
-Overlay = ScreenSpaceOverlay | GivenOverlay
+Overlay = ScreenSpaceOverlay | OracleOverlay
 
 
 class Artifacts(nn.Module):
@@ -46,12 +46,12 @@ class Artifacts(nn.Module):
 
     def __getitem__(self, group: int) -> Overlay:
         overlay = self.overlays[group]
-        assert isinstance(overlay, ScreenSpaceOverlay | GivenOverlay)
+        assert isinstance(overlay, ScreenSpaceOverlay | OracleOverlay)
         return overlay
 
     def put(
         self,
-        overlays: Sequence[ScreenSpaceOverlay | GivenOverlay | None],
+        overlays: Sequence[ScreenSpaceOverlay | OracleOverlay | None],
         keys: Tensor,
         groups: list[int],
         lenses: Tensor,
@@ -76,7 +76,7 @@ class Artifacts(nn.Module):
     @property
     def exceed_white(self) -> bool:
         """Whether what they add can bring a picture beyond white, where a photo clips."""
-        return any(isinstance(overlay, GivenOverlay) or overlay.adds_light for overlay in self.overlays)
+        return any(isinstance(overlay, OracleOverlay) or overlay.adds_light for overlay in self.overlays)
 
     def learned(self) -> list[ScreenSpaceOverlay]:
         """The overlays that have parameters."""
@@ -99,7 +99,7 @@ class Artifacts(nn.Module):
             group = match_camera(camera, self._keys + self._bare)
         if group is None:
             group = nearest_aspect(camera, self._keys)
-        return fitted(self[group], height, width) if group < len(self) else None
+        return letterboxed_layers(self[group], height, width) if group < len(self) else None
 
     @torch.no_grad()
     def covered(self, group: int) -> tuple[Tensor, Tensor]:
@@ -133,7 +133,7 @@ class Artifacts(nn.Module):
         given = f"{prefix}overlays.0.transmittance" in state
         if len(self) or len(self.bare_keys):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
-            if frames != here or (frames and given != isinstance(self[0], GivenOverlay)):
+            if frames != here or (frames and given != isinstance(self[0], OracleOverlay)):
                 raise InputError(
                     f"the checkpoint's overlays are {('given' if given else 'learned')}, (height, width, downscale, "
                     f"adds light) {frames or 'absent'}, this run's are {here or 'absent'}",
@@ -146,7 +146,7 @@ class Artifacts(nn.Module):
             )
         device = self.camera_keys.device
         self.overlays = nn.ModuleList(
-            GivenOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3))
+            OracleOverlay(torch.ones(h, w, 3), torch.zeros(h, w, 3))
             if given
             else ScreenSpaceOverlay(h, w, resolution, bool(light))
             for h, w, resolution, light in frames
@@ -166,7 +166,7 @@ class Artifacts(nn.Module):
             InputError: the checkpoint knows no camera like one of this run's, or was trained with another setting.
         """
         self.make_room(state, prefix, wanted=True)
-        here = "given" if len(self) and isinstance(self[0], GivenOverlay) else "on" if len(self) else "off"
+        here = "given" if len(self) and isinstance(self[0], OracleOverlay) else "on" if len(self) else "off"
         if setting not in ("auto", here):
             raise InputError(
                 f"the checkpoint was trained with overlay {here}, this run has {setting}",

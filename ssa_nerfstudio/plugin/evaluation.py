@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.metrics import image as metrics
-from ssa_nerfstudio.overlay.pictures import over_checkerboard
+from ssa_nerfstudio.overlay.rgba import over_checkerboard
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 
 

@@ -15,9 +15,10 @@ from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio.overlay.compositing import clipped, composite
-from ssa_nerfstudio.overlay.losses import photometric, sparsity
+from ssa_nerfstudio.overlay.compositing import clip_straight_through, composite
+from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.resampling import straight_color
+from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.compat.upstream import without_lpips
 from ssa_nerfstudio.plugin.evaluation import figures_of_step, figures_of_view, pictures_of_view
@@ -127,16 +128,16 @@ class SSASplatfactoModel(SplatfactoModel):
         super().step_cb(optimizers, step)
         waiting = step < self.config.scene_head_start and self.config.overlay_start == "detected"
         for overlay in self.artifacts.learned():
-            overlay.wait_for_the_scene(waiting)
+            overlay.hold_far_pixels(waiting)
 
     def step_post_backward(self, step: int) -> None:
         """After the optimizers' step: bring parameters back into their range, then densify."""
         for overlay in self.artifacts.learned():
-            overlay.take_back()
+            overlay.restore_held()
         if self.config.guards and step % guards.RANGE_EVERY == 0:
             guards.keep_scales_in_range(self.scales)
             for overlay in self.artifacts.learned():
-                overlay.keep_in_range()
+                overlay.clamp_logits()
         super().step_post_backward(step)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
@@ -180,7 +181,7 @@ class SSASplatfactoModel(SplatfactoModel):
             if overlay is None:
                 return drawn
             behind = (drawn["accumulation"], drawn["background"]) if self.config.ignore_background else None
-            drawn["composite"] = overlay.in_front_of(drawn["rgb"], reduction, behind)
+            drawn["composite"] = overlay.composite(drawn["rgb"], reduction, behind)
         else:
             layers = self.artifacts.layers_of_camera(camera, width, height)
             if layers is None:
@@ -188,7 +189,7 @@ class SSASplatfactoModel(SplatfactoModel):
             drawn["composite"] = composite(drawn["rgb"], *layers)
             drawn["overlay_rgb"], drawn["overlay_alpha"] = straight_color(*layers)
         if self.artifacts.exceed_white:
-            drawn["composite"] = clipped(drawn["composite"])
+            drawn["composite"] = clip_straight_through(drawn["composite"])
         return drawn
 
     def _render(self, camera: Cameras, width: int, height: int, reduction: int) -> dict[str, Any]:
@@ -265,12 +266,12 @@ class SSASplatfactoModel(SplatfactoModel):
         if "mask" in batch:
             mask = self._downscale_if_required(batch["mask"].float()).to(self.device)
             target, shown = target * mask, shown * mask
-        losses = {"main_loss": photometric(shown, target, self.config.ssim_lambda, self.config.ssim)}
+        losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
         if not self.training:
             return losses
         learned = self.artifacts.learned()
         if learned and self.config.sparsity != "off":
-            terms = [sparsity(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
+            terms = [sparsity_loss(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
             losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
         if self.config.strategy == "mcmc":
             losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()

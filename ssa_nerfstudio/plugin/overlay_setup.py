@@ -14,7 +14,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import LEAST_VIEWS, Detection, detect, static_area
 from ssa_nerfstudio.evidence.initialization import initialize
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.settings import ModelSettings
 
 
@@ -50,7 +50,7 @@ def learned_overlays(
     return overlays
 
 
-def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[GivenOverlay]:
+def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[OracleOverlay]:
     """The true layers of every camera group from an .npz file.
 
     Raises:
@@ -63,7 +63,7 @@ def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[Give
     try:
         arrays = np.load(path)
         names = [("T", "B")] if len(sizes) == 1 and "T" in arrays else [(f"T{g}", f"B{g}") for g in range(len(sizes))]
-        overlays = [GivenOverlay(torch.from_numpy(arrays[t]), torch.from_numpy(arrays[b])) for t, b in names]
+        overlays = [OracleOverlay(torch.from_numpy(arrays[t]), torch.from_numpy(arrays[b])) for t, b in names]
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise InputError(f"{path} holds no usable layers ({error})", "give an .npz with T and B [H, W, 3]") from error
     for overlay, size in zip(overlays, sizes, strict=True):

@@ -8,7 +8,7 @@ from typing import Literal
 
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
-from ssa_nerfstudio.overlay.losses import Sparsity, SSIMBody
+from ssa_nerfstudio.overlay.sparsity import Sparsity
 from ssa_nerfstudio.rasterization import RasterizerName
 
 
@@ -38,9 +38,6 @@ class ModelSettings(SplatfactoModelConfig):
     """Weight of the sparsity term, lambda_sparse, not negative; the paper has 0.05, and 0.01 for mud."""
     ignore_background: bool = True
     """The overlay gains nothing by hiding background that no splat covers (a sky without points); the paper's does."""
-    ssim: SSIMBody = "fused"
-    """How the SSIM term is computed; the result is the same. fused: kernels, the fastest; convolution, shifted-sums:
-    plain torch, for comparison."""
     strategy: Literal["adc", "mcmc"] = "adc"
     """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
     cap_max: int = 1_000_000

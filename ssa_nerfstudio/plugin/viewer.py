@@ -20,8 +20,8 @@ from nerfstudio.viewer.viewer_elements import ViewerCheckbox, ViewerDropdown, Vi
 from torch import Tensor, nn
 
 from ssa_nerfstudio.overlay.compositing import composite
-from ssa_nerfstudio.overlay.pictures import over_checkerboard, straight_bytes
 from ssa_nerfstudio.overlay.resampling import straight_color
+from ssa_nerfstudio.overlay.rgba import over_checkerboard, to_rgba8
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 
 LAYERS = ["composite", "artifact", "matte", "clean"]
@@ -115,7 +115,7 @@ class ArtifactControls(nn.Module):
         group = self._group() or 0
         with torch.no_grad():
             transmittance, addition = self._artifacts()[group].layers()
-        rgba = straight_bytes(transmittance, addition)
+        rgba = to_rgba8(transmittance, addition)
         encoded, png = cv2.imencode(".png", cv2.cvtColor(rgba, cv2.COLOR_RGBA2BGRA))
         assert encoded
         return f"artifact-camera-{group}.png", png.tobytes()

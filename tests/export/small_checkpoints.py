@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from ssa_nerfstudio.cameras.lens import Lens, undistorted
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 
 
@@ -26,7 +26,7 @@ def random_gaussians(count: int, bands: int = 15, seed: int = 0) -> dict[str, to
     return {name: torch.randn(count, *shape, generator=generator) for name, shape in shapes.items()}
 
 
-def one_camera(overlay: ScreenSpaceOverlay | GivenOverlay, lens: Lens | None = None) -> Artifacts:
+def one_camera(overlay: ScreenSpaceOverlay | OracleOverlay, lens: Lens | None = None) -> Artifacts:
     """An artifact in front of one camera; its lens has no distortion unless one is given."""
     return cameras([(overlay, lens or Lens(overlay.width, overlay.height, 50, 50, overlay.width / 2, 20))])
 

@@ -15,13 +15,13 @@ from small_checkpoints import cameras, one_camera, write_run
 from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.export.artifact_files import FILES
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 
 WIDTH, HEIGHT = 96, 64
 
 
-def given(layers) -> GivenOverlay:
-    return GivenOverlay(torch.from_numpy(layers.transmittance), torch.from_numpy(layers.addition))
+def given(layers) -> OracleOverlay:
+    return OracleOverlay(torch.from_numpy(layers.transmittance), torch.from_numpy(layers.addition))
 
 
 def learned(width: int = WIDTH, height: int = HEIGHT, seed: int = 0, resolution: int = 1) -> ScreenSpaceOverlay:
@@ -325,7 +325,7 @@ def test_original_photos_of_twice_the_size_are_restored(tmp_path, draw_effect):
     truth = photo(3, 2 * WIDTH, 2 * HEIGHT)
     Image.fromarray(large.apply(truth)).save(tmp_path / "photos" / "a.png")
     export(
-        write_run(tmp_path / "run", one_camera(GivenOverlay(*small))), tmp_path / "out", "--apply", tmp_path / "photos"
+        write_run(tmp_path / "run", one_camera(OracleOverlay(*small))), tmp_path / "out", "--apply", tmp_path / "photos"
     )
     restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
     before = np.abs(large.apply(truth).astype(int) - truth).mean()

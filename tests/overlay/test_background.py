@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats, paint
+from ssa_nerfstudio.overlay.compositing import composite, composite_logits, composite_over_splats
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 
@@ -85,7 +85,7 @@ def test_painting_by_hand_has_the_values_and_gradients_of_the_layers(over_splats
         leaf = clean.clone().requires_grad_()
         overlay.zero_grad()
         if by_hand:
-            picture = paint(leaf, overlay.color_logits, overlay.alpha_logits, behind)
+            picture = composite_logits(leaf, overlay.color_logits, overlay.alpha_logits, behind)
         elif behind is None:
             picture = composite(leaf, *overlay.layers())
         else:
@@ -112,7 +112,7 @@ def test_an_overlay_is_in_front_of_a_render_as_its_layers_say(resolution, reduct
     for ours in (True, False):
         overlay.zero_grad()
         if ours:
-            shown = overlay.in_front_of(clean, reduction, behind)
+            shown = overlay.composite(clean, reduction, behind)
         elif behind is None:
             shown = composite(clean, *overlay.layers(reduction))
         else:

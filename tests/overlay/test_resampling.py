@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.compositing import composite
-from ssa_nerfstudio.overlay.layer import GivenOverlay, ScreenSpaceOverlay, fitted
+from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import (
     box_reduce,
     enlarge,
     letterbox,
+    premultiply,
     reduced_size,
-    stack_premultiplied,
     straight_color,
     to_training_scale,
 )
@@ -76,7 +76,7 @@ def test_a_constant_layer_stays_constant_at_any_training_scale(
 @given(seed=st.integers(0, 1000), least=st.sampled_from([1e-3, 0.1, 1.0]))
 def test_straight_color_and_matte_come_back_from_the_premultiplied_pair(seed: int, least: float) -> None:
     color, alpha = random(5, 6, 3, seed=seed), least + (1 - least) * random(5, 6, 1, seed=seed + 1)
-    transmittance, addition = stack_premultiplied(color, alpha)
+    transmittance, addition = premultiply(color, alpha)
     color_again, alpha_again = straight_color(transmittance, addition)
     torch.testing.assert_close(alpha_again, alpha, rtol=0, atol=1e-14)
     torch.testing.assert_close(color_again, color, rtol=0, atol=1e-12)
@@ -86,7 +86,7 @@ def test_the_premultiplied_pair_comes_back_from_straight_color_and_matte() -> No
     alpha = random(5, 6, 1)
     alpha[:2] = 0
     transmittance, addition = 1 - alpha, alpha * random(5, 6, 3, seed=1)
-    again = stack_premultiplied(*straight_color(transmittance, addition))
+    again = premultiply(*straight_color(transmittance, addition))
     torch.testing.assert_close(again[0], transmittance, rtol=0, atol=1e-15)
     torch.testing.assert_close(again[1], addition, rtol=0, atol=1e-15)
 
@@ -151,9 +151,9 @@ def test_a_letterbox_of_the_same_size_is_the_layer_itself() -> None:
 
 @pytest.mark.parametrize("kind", ["learned", "given"])
 def test_around_a_fitted_overlay_the_render_is_untouched(kind: str) -> None:
-    overlay = ScreenSpaceOverlay(20, 30) if kind == "learned" else GivenOverlay(*[0.5 * random(20, 30, 3)] * 2)
+    overlay = ScreenSpaceOverlay(20, 30) if kind == "learned" else OracleOverlay(*[0.5 * random(20, 30, 3)] * 2)
     clean = random(50, 40, 3, dtype=torch.float32)
-    transmittance, addition = fitted(overlay, 50, 40)
+    transmittance, addition = letterboxed_layers(overlay, 50, 40)
     drawn = composite(clean, transmittance, addition)
     assert torch.equal(drawn[:11], clean[:11])  # 27 rows of 40 pixels lie in the middle
     assert torch.equal(drawn[38:], clean[38:])
@@ -169,7 +169,7 @@ def test_around_a_fitted_overlay_the_render_is_untouched(kind: str) -> None:
         lambda layer: letterbox(layer, 4, 3, 0.0),
         lambda layer: to_training_scale(layer, 4, 2, 18, 26),
         lambda layer: to_training_scale(layer, 2, 4, 9, 13),
-        lambda layer: stack_premultiplied(layer[..., :3], layer[..., 3:]),
+        lambda layer: premultiply(layer[..., :3], layer[..., 3:]),
         lambda layer: straight_color(layer[..., 3:], 0.1 * layer[..., :3]),
     ],
     ids=["box_reduce", "enlarge", "letterbox", "small letterbox", "finer", "coarser", "stack", "straight"],

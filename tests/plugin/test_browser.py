@@ -12,7 +12,7 @@ from PIL import Image
 
 from benchmarks import screenshots
 from ssa_nerfstudio.export.checkpoint import Checkpoint
-from ssa_nerfstudio.overlay.layer import fitted
+from ssa_nerfstudio.overlay.layer import letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
 
 pytestmark = pytest.mark.browser
@@ -61,7 +61,7 @@ def eventually(page, holds: Callable[[np.ndarray], bool], what: str) -> np.ndarr
 def test_the_artifact_appears_and_disappears(page, config):
     first = eventually(page, lambda seen: seen.std() > 0.02, "no frame came")
     height, width = first.shape[:2]
-    color, alpha = straight_color(*fitted(Checkpoint.read(config).artifacts()[0], height, width))
+    color, alpha = straight_color(*letterboxed_layers(Checkpoint.read(config).artifacts()[0], height, width))
     color, opaque = color.detach().numpy(), alpha.detach().numpy()[..., 0] > 0.9
     # The axes that viser draws into the lower left corner.
     opaque[-80:, :80] = False

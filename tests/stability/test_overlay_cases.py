@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.compositing import composite, composite_over_splats
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay, fitted
-from ssa_nerfstudio.overlay.losses import SSIM_WINDOW, Sparsity, photometric, photometric_reference, sparsity
-from ssa_nerfstudio.overlay.resampling import box_reduce, letterbox, stack_premultiplied, straight_color
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay, letterboxed_layers
+from ssa_nerfstudio.overlay.photometric import SSIM_WINDOW, photometric_loss, photometric_reference
+from ssa_nerfstudio.overlay.resampling import box_reduce, letterbox, premultiply, straight_color
+from ssa_nerfstudio.overlay.sparsity import Sparsity, sparsity_loss
 
 OVERLAY = Family("Overlay")
 
@@ -35,7 +36,7 @@ def step(overlay: ScreenSpaceOverlay, clean: Tensor, photo: Tensor, kind: Sparsi
     """The whole loss of a training step and its gradients, which have to be finite."""
     transmittance, addition = overlay.layers(reduction)
     picture = composite_over_splats(clean, torch.ones(*clean.shape[:2], 1), torch.zeros(3), transmittance, addition)
-    loss = photometric(picture, photo, 0.2) + 0.05 * sparsity(overlay.matte(), overlay.evidence, kind)
+    loss = photometric_loss(picture, photo, 0.2) + 0.05 * sparsity_loss(overlay.matte(), overlay.evidence, kind)
     loss.backward()
     for leaf in (*overlay.parameters(), clean):
         assert leaf.grad is not None
@@ -67,7 +68,7 @@ def _saturated(alpha: float, color: float) -> None:
 @OVERLAY.case("opaque over the whole frame", "With the matte at its cap the scene behind must keep a gradient.")
 def _() -> None:
     overlay, clean = filled(20, 24, 40.0, 0.0), random(20, 24, 3).requires_grad_()
-    overlay.keep_in_range()
+    overlay.clamp_logits()
     step(overlay, clean, random(20, 24, 3, seed=1))
     assert clean.grad is not None
     assert (clean.grad.abs() > 0).float().mean() > 0.99
@@ -76,7 +77,7 @@ def _() -> None:
 @OVERLAY.case("clear over the whole frame", "An empty overlay must still be able to learn an artifact.")
 def _() -> None:
     overlay = filled(20, 24, -400.0, 0.0)
-    overlay.keep_in_range()
+    overlay.clamp_logits()
     step(overlay, random(20, 24, 3).requires_grad_(), random(20, 24, 3, seed=1))
     assert overlay.alpha_logits.grad is not None
     assert (overlay.alpha_logits.grad.abs() > 1e-12).float().mean() > 0.99
@@ -106,7 +107,7 @@ def _frames(height: int, width: int) -> None:
 )
 def _() -> None:
     overlay = filled(4320, 7680, -2.0, 0.0)
-    value = sparsity(overlay.matte(), overlay.evidence, "l1")
+    value = sparsity_loss(overlay.matte(), overlay.evidence, "l1")
     value.backward()
     expected = 1 / (1 + math.exp(2.0))
     assert abs(value.item() - expected) < 1e-5
@@ -125,7 +126,7 @@ def _drift(rate: float, steps: int) -> None:
             for parameter in overlay.parameters():
                 parameter.grad = torch.full_like(parameter, sign * 1e-7)
             optimizer.step()
-            overlay.keep_in_range()
+            overlay.clamp_logits()
         optimizer.zero_grad()
         clean = random(2, 3, 3).requires_grad_()
         composite(clean, *overlay.layers()).sum().backward()
@@ -166,7 +167,7 @@ def _half(dtype: torch.dtype) -> None:
 @OVERLAY.case("black render and white photo", "The largest difference there is.", 0.0, 1.0)
 def _flat(render: float, photo: float) -> None:
     a, b = torch.full((16, 16, 3), render, requires_grad=True), torch.full((16, 16, 3), photo)
-    value = photometric(a, b, 0.2)
+    value = photometric_loss(a, b, 0.2)
     value.backward()
     assert a.grad is not None
     assert torch.isfinite(a.grad).all()
@@ -179,7 +180,7 @@ def _tells(value: float) -> None:
     render = random(16, 16, 3)
     render[7, 7, 1] = value
     render.requires_grad_()
-    loss = photometric(render, random(16, 16, 3, seed=1), 0.2)
+    loss = photometric_loss(render, random(16, 16, 3, seed=1), 0.2)
     loss.backward()
     assert render.grad is not None
     assert not (torch.isfinite(loss) and torch.isfinite(render.grad).all())
@@ -188,7 +189,7 @@ def _tells(value: float) -> None:
 @OVERLAY.case("a letterbox of one pixel", "A frame scaled to nothing must keep a pixel.")
 def _() -> None:
     for size in ((1, 1), (1, 500), (500, 1)):
-        for part in fitted(filled(37, 53, 1.0, 1.0), *size):
+        for part in letterboxed_layers(filled(37, 53, 1.0, 1.0), *size):
             assert part.shape[:2] == size
             assert torch.isfinite(part).all()
 
@@ -220,7 +221,7 @@ def _energy(seed: int, rows: int, columns: int, factor: int) -> None:
     """Means are kept, and compositing then reducing is reducing then compositing where the scene is flat."""
     height, width = rows * factor, columns * factor
     color, alpha = random(height, width, 3, seed=seed), random(height, width, 1, seed=seed + 1)
-    transmittance, addition = stack_premultiplied(color, alpha)
+    transmittance, addition = premultiply(color, alpha)
     small_t, small_b = box_reduce(transmittance, factor), box_reduce(addition, factor)
     torch.testing.assert_close(small_t.mean(), transmittance.mean())
     torch.testing.assert_close(small_b.mean((0, 1)), addition.mean((0, 1)))
@@ -250,7 +251,7 @@ def _odd_sizes(seed: int, height: int, width: int, to_height: int, to_width: int
 def _straight(seed: int) -> None:
     """Premultiplying and back gives color and matte again wherever there is a matte."""
     color, alpha = random(4, 5, 3, seed=seed), random(4, 5, 1, seed=seed + 1) * 0.99 + 0.01
-    again, matte = straight_color(*stack_premultiplied(color, alpha))
+    again, matte = straight_color(*premultiply(color, alpha))
     torch.testing.assert_close(matte, alpha, atol=1e-6, rtol=0)
     torch.testing.assert_close(again, color, atol=2e-5, rtol=0)
 

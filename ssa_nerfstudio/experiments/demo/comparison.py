@@ -17,7 +17,7 @@ from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.effects.watermark import Watermark
 from ssa_nerfstudio.experiments.runs.training_run import Outcome, configure, train_and_evaluate, versions
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
-from ssa_nerfstudio.overlay.pictures import over_checkerboard
+from ssa_nerfstudio.overlay.rgba import over_checkerboard
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 
 ARTIFACTS = {"dashboard": Dashboard, "watermark": Watermark}

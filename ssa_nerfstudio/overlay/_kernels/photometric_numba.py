@@ -1,4 +1,4 @@
-"""L1 + SSIM and its gradient on a CPU: numba, two passes over rows, vectorised along them. See `losses.photometric`."""
+"""L1 + SSIM and its gradient on a CPU: numba, two passes over rows, vectorized along them. See `photometric_loss`."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from numba import njit
 from ssa_nerfstudio._system.kernel_threads import on_all_threads
 
 FAST = {"reassoc", "contract", "arcp", "nsz"}
-"""What vectorising needs of LLVM's fast-math, but not its promise that no value is NaN: the loss has to show one."""
+"""The fast-math flags that vectorizing needs, without `nnan` and `ninf`: the loss of a NaN has to be NaN."""
 
 
 def value_and_gradient(
     prediction: np.ndarray, target: np.ndarray, ssim_weight: float, window: np.ndarray
 ) -> tuple[float, np.ndarray]:
-    """Loss and its gradient with respect to the prediction.
+    """Compute the loss and its gradient with respect to the prediction.
 
     Args:
         prediction, target: [C, H, W], contiguous, one float dtype.
+        ssim_weight: w in [0, 1].
         window: [K] weights that sum to 1, symmetric, of the images' dtype.
 
     Returns:

@@ -1,9 +1,9 @@
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false, reportIndexIssue=false
-# (Triton's kernels are no Python to a type checker.)
-"""L1 + SSIM and its gradient on CUDA: four Triton kernels, each bound by memory. See `losses.photometric`.
+# (Type checkers do not understand Triton's kernels.)
+"""L1 + SSIM and its gradient on CUDA: four Triton kernels, each bound by memory bandwidth. See `photometric_loss`.
 
-Images stay [H, W, C]: a shift by one pixel is a shift by C in memory, so that no channel needs to be told apart.
-Shares of the loss are written per block and added by torch, in an order that does not change from run to run.
+Images stay [H, W, C]: a shift by one pixel is a shift by C in memory, the same for all channels. Partial sums of the
+loss are written per block and added by torch, in an order that does not change from run to run.
 """
 
 from __future__ import annotations
@@ -19,7 +19,16 @@ _BLOCK = 512
 def value_and_gradient(
     prediction: Tensor, target: Tensor, ssim_weight: float, window: tuple[float, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Loss (a scalar tensor) and its gradient with respect to the prediction [H, W, C], both float32 on the device."""
+    """Compute the loss and its gradient with respect to the prediction.
+
+    Args:
+        prediction, target: [H, W, C] on a CUDA device.
+        ssim_weight: w in [0, 1].
+        window: [K] weights that sum to 1, symmetric.
+
+    Returns:
+        The loss, a float32 scalar, and its gradient [H, W, C] of the prediction's dtype, both on the device.
+    """
     x, y = prediction.float().contiguous(), target.float().contiguous()
     height, width, channels = x.shape
     size = len(window)
@@ -46,13 +55,15 @@ def value_and_gradient(
     return shares.sum() + ssim_weight, gradient.to(prediction.dtype)
 
 
-_windows: dict[torch.device, Tensor] = {}
+# Copied to a device once: a copy at every step would wait for it.
+_windows: dict[tuple[torch.device, tuple[float, ...]], Tensor] = {}
 
 
 def _window_on(device: torch.device, window: tuple[float, ...]) -> Tensor:
-    if device not in _windows:
-        _windows[device] = torch.tensor(window, device=device)
-    return _windows[device]
+    key = device, window
+    if key not in _windows:
+        _windows[key] = torch.tensor(window, device=device)
+    return _windows[key]
 
 
 @triton.jit

@@ -31,6 +31,13 @@ def test_an_infinite_psnr_is_valid_json(one, tmp_path):
     assert read(path).metrics["psnr"] is None
 
 
+def test_a_model_setting_that_no_longer_exists_is_read_as_it_was_written(one, tmp_path):
+    run = dataclasses.replace(one.run, model={**one.run.model, "ssim": "shifted-sums"})
+    path = tmp_path / f"{run.id}.json"
+    write(dataclasses.replace(one, run=run), path)
+    assert read(path).run.model["ssim"] == "shifted-sums"
+
+
 def _broken(values: dict, change: str) -> str:
     if change == "status":
         values["status"] = "good"

@@ -497,7 +497,7 @@ def press(guarded: bool, steps: int, sign: float) -> ScreenSpaceOverlay:
             parameter.grad = torch.full_like(parameter, sign * 1e-6)
         optimizer.step()
         if guarded:
-            overlay.keep_in_range()
+            overlay.clamp_logits()
     return overlay
 
 

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from ssa_nerfstudio.overlay.pictures import over_checkerboard
+from ssa_nerfstudio.overlay.rgba import over_checkerboard
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 
 WIDEST = 480

@@ -27,7 +27,6 @@ KNOBS = {
     "cap_max": "number of Gaussians",
     "sparsity": "what keeps the matte sparse",
     "ssim_lambda": "weight of the SSIM term",
-    "ssim": "how SSIM is computed",
     "rasterizer": "what draws the splats",
 }
 """For people who do not know the options by their names."""

@@ -1,4 +1,4 @@
-"""An artifact as a picture to look at."""
+"""Overlays as RGBA images for display."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from torch import Tensor
 
 from ssa_nerfstudio.overlay.resampling import straight_color
 
-_SQUARES = (0.5, 0.35)
+_LIGHT, _DARK = 0.5, 0.35
 
 
 def over_checkerboard(color: Tensor, alpha: Tensor, side: int = 8) -> Tensor:
-    """A straight-alpha picture over gray squares, on which transparency shows.
+    """Composite a straight-alpha image over a gray checkerboard, which shows its transparency.
 
     Args:
         color: [H, W, 3] in [0, 1].
@@ -20,16 +20,23 @@ def over_checkerboard(color: Tensor, alpha: Tensor, side: int = 8) -> Tensor:
         side: of a square, pixels.
 
     Returns:
-        [H, W, 3].
+        [H, W, 3] in [0, 1].
     """
     rows = torch.arange(color.shape[0], device=color.device)[:, None] // side
     columns = torch.arange(color.shape[1], device=color.device) // side
-    light, dark = _SQUARES
-    board = dark + (light - dark) * ((rows + columns) % 2 == 0)[..., None].to(color.dtype)
+    board = _DARK + (_LIGHT - _DARK) * ((rows + columns) % 2 == 0)[..., None].to(color.dtype)
     return alpha * color + (1.0 - alpha) * board
 
 
-def straight_bytes(transmittance: Tensor, addition: Tensor) -> np.ndarray:
-    """Layers [H, W, 1 or 3] and [H, W, 3] as a straight-alpha picture: RGBA, uint8 [H, W, 4]."""
+def to_rgba8(transmittance: Tensor, addition: Tensor) -> np.ndarray:
+    """Convert layers to a straight-alpha image.
+
+    Args:
+        transmittance: T [H, W, 1] or [H, W, 3] in [0, 1].
+        addition: B [H, W, 3].
+
+    Returns:
+        RGBA, uint8 [H, W, 4].
+    """
     rgba = torch.cat(straight_color(transmittance, addition), dim=-1)
     return (rgba.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
