@@ -1,6 +1,6 @@
-"""A hook of mkdocs: equations become MathML when the site is built, which browsers draw without scripts or fonts.
+"""A hook of mkdocs: equations become MathML, which browsers draw without scripts or fonts.
 
-Pages write them the way GitHub shows them: a block fenced as `math`, and inline a dollar sign around backticks.
+Pages use GitHub's notation: a block fenced as `math`, and inline a dollar sign around backticks.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _INLINE = re.compile(r"\$`([^`\n]+)`\$")
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Put MathML in the place of every equation."""
+    """Replace every equation by MathML."""
     return _INLINE.sub(_inline, _BLOCK.sub(_block, markdown))
 
 

@@ -1,4 +1,4 @@
-"""A hook of mkdocs: writes the reference of commands and configuration from the dataclasses when the site is built."""
+"""A hook of mkdocs: generates the reference of commands and configuration from their dataclasses."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ OWN = {
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Put the generated part where a page asks for it.
+    """Replace the markers of a page by the generated tables.
 
     Raises:
-        RuntimeError: a field has no docstring, which would leave a hole in the reference.
+        RuntimeError: a field has no docstring.
     """
     if "<!-- commands -->" in markdown:
         markdown = markdown.replace("<!-- commands -->", "\n".join(map(_command, COMMANDS)))
@@ -53,7 +53,7 @@ def _option(name: str, prefix: str = "--") -> str:
 
 
 def _fields(cls: type) -> list[tuple[dataclasses.Field, str]]:
-    """The fields that a class itself declares, with their docstrings."""
+    """The fields that a class itself declares, and their docstrings."""
     texts = {p.arg_name: p.description for p in docstring_parser.parse_from_object(cls).params}
     declared = [f for f in dataclasses.fields(cls) if f.name in vars(cls)["__annotations__"] and f.name[0] != "_"]
     missing = [f.name for f in declared if not texts.get(f.name)]
@@ -65,7 +65,7 @@ def _fields(cls: type) -> list[tuple[dataclasses.Field, str]]:
 def _table(rows: list[tuple[str, dataclasses.Field, str]]) -> str:
     lines = ["| option | type | default | |", "|---|---|---|---|"]
     for option, field, text in rows:
-        # Within backticks Markdown takes | and * as they are, and would show a backslash in front of them.
+        # Within backticks Markdown shows | and * as they are, and a backslash before them, too.
         prose = re.sub(r"(`[^`]*`)|([|*])", lambda found: found[1] or f"\\{found[2]}", text)
         cells = (f"`{option}`", f"`{_type(field)}`", _default(field), prose)
         lines.append("| " + " | ".join(re.sub(r"\s+", " ", cell) for cell in cells) + " |")
@@ -73,7 +73,7 @@ def _table(rows: list[tuple[str, dataclasses.Field, str]]) -> str:
 
 
 def _positional(field: dataclasses.Field) -> bool:
-    """Whether it is written without a flag."""
+    """Whether an argument is positional."""
     return "tyro.conf.Positional" in str(field.type)
 
 

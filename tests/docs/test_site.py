@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import importlib
 import os
 import re
 import subprocess
@@ -9,8 +11,10 @@ import sys
 from pathlib import Path
 
 import pytest
+from nerfstudio.scripts.downloads.download_data import nerfstudio_file_ids
 
-from ssa_nerfstudio.cli import COMMANDS
+from ssa_nerfstudio.cli import COMMANDS, main
+from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 
 ROOT = Path(__file__).parents[2]
 
@@ -101,6 +105,26 @@ def test_every_file_that_a_page_links_exists(page):
     assert [link for link in links if not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_option_that_a_page_shows_exists(page):
+    text = page.read_text().replace("\\\n", " ")
+    for name, line in re.findall(r"\bssa ([a-z][a-z-]*)\b([^\n`]*)", text):
+        if name in COMMANDS:
+            command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+            known = {field.name.replace("_", "-") for field in dataclasses.fields(command)} | {"help"}
+            shown = re.findall(r"(?<!\S)--([a-z-]+)", line.split("#")[0])
+            assert [option for option in shown if not {option, option.removeprefix("no-")} & known] == [], line
+    settings = {field.name for field in dataclasses.fields(SSASplatfactoModelConfig)}
+    shown = re.findall(r"--pipeline\.model\.([a-z][a-z-]*)", text)
+    assert [name for name in shown if name.replace("-", "_") not in settings] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_capture_that_a_page_names_can_be_downloaded(page):
+    named = re.findall(r"ns-download-data nerfstudio --capture-name ([\w-]+)", page.read_text())
+    assert [name for name in named if name not in nerfstudio_file_ids] == []
+
+
 def test_the_site_fetches_nothing_from_the_internet(site):
     for page in site.glob("*.html"):
         assert 'src="http' not in page.read_text()
@@ -108,11 +132,6 @@ def test_the_site_fetches_nothing_from_the_internet(site):
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
 def test_help_explains_every_option(name, capsys):
-    import dataclasses
-    import importlib
-
-    from ssa_nerfstudio.cli import main
-
     with pytest.raises(SystemExit) as caught:
         main([name, "--help"])
     assert caught.value.code == 0
