@@ -1,4 +1,4 @@
-"""Ships configs/ as ssa_nerfstudio/configs, which pyproject.toml alone cannot say; all else is there."""
+"""Ships configs/ as ssa_nerfstudio/configs, and HTML templates; pyproject.toml holds all else."""
 
 from setuptools import find_namespace_packages, find_packages, setup
 
@@ -6,5 +6,8 @@ configs = ["ssa_nerfstudio.configs", *(f"ssa_nerfstudio.configs.{kind}" for kind
 setup(
     packages=[*find_packages(include=["ssa_nerfstudio*"]), *configs],
     package_dir={"ssa_nerfstudio.configs": "configs"},
-    package_data={name: ["*.yaml"] for name in configs},
+    package_data={
+        "ssa_nerfstudio.experiments": ["templates/*.html"],
+        **{name: ["*.yaml"] for name in configs},
+    },
 )

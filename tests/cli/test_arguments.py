@@ -100,8 +100,14 @@ def test_a_value_of_the_wrong_type(name, flag, value, capsys):
     [
         (["detect", "--data"], "--data"),
         (["detect", "--data", "--json", "x"], "--data"),
-        (["detect", "--data=x", "--draws=many"], "Error parsing --draws: invalid literal for int() with base 10: 'many'"),
-        (["detect", "photos"], "Missing from ssa detect: --data PATH; Unrecognized options: photos (ssa detect --help)"),
+        (
+            ["detect", "--data=x", "--draws=many"],
+            "Error parsing --draws: invalid literal for int() with base 10: 'many'",
+        ),
+        (
+            ["detect", "photos"],
+            "Missing from ssa detect: --data PATH; Unrecognized options: photos (ssa detect --help)",
+        ),
         (["detect", "--data", "my", "photos"], "Unrecognized options: photos (ssa detect --help)"),
         (["bench", "smoke", "captures", "--output", "x"], "Unrecognized options: captures"),
         (

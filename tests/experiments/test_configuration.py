@@ -196,7 +196,7 @@ def test_a_bad_effect_file_is_named(tmp_path):
         read_effects((str(path),))
 
 
-def test_configurations_are_installed_with_the_package(tmp_path):
+def test_configurations_and_templates_are_installed_with_the_package(tmp_path):
     built = tmp_path / "built"
     command = [sys.executable, "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path), "build_py"]
     subprocess.run([*command, "--build-lib", str(built)], cwd=REPOSITORY, check=True, capture_output=True)
@@ -206,6 +206,8 @@ def test_configurations_are_installed_with_the_package(tmp_path):
     found = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, capture_output=True, text=True
     ).stdout.split()
+    templates = Path("ssa_nerfstudio/experiments/templates")
+    assert {path.name for path in (built / templates).iterdir()} == {p.name for p in (REPOSITORY / templates).iterdir()}
     folder = built / "ssa_nerfstudio/configs"
     expected = sorted(path.relative_to(REPOSITORY / "configs") for path in (REPOSITORY / "configs").glob("*/*.yaml"))
     assert sorted(Path(path).relative_to(folder) for path in found) == [

@@ -1,0 +1,47 @@
+"""HTML pages from the templates beside this module; a page embeds its pictures and needs no other file."""
+
+from __future__ import annotations
+
+import base64
+import functools
+import re
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader
+from markupsafe import Markup, escape
+
+_MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml"}
+
+
+def render_page(template: str, title: str, **values: Any) -> str:
+    """Render a page.
+
+    Args:
+        template: file in `templates/`, which extends base.html.
+        title: of the page.
+        values: what the template shows; text is escaped.
+
+    Returns:
+        The page as HTML.
+    """
+    return _environment().get_template(template).render(title=title, **values)
+
+
+@functools.cache
+def _environment() -> Environment:
+    loader = FileSystemLoader(Path(__file__).parent / "templates")
+    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters |= {"inline": _inline, "embedded": _embedded}
+    return environment
+
+
+def _inline(text: str) -> Markup:
+    """Text in which **bold** and `code` are marked as in Markdown."""
+    marked = re.sub(r"\*\*(.+?)\*\*", r"<b>\1</b>", str(escape(text)))
+    return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", marked))
+
+
+def _embedded(picture: Path) -> str:
+    """A picture's file as a data URI."""
+    return f"data:{_MEDIA_TYPES[picture.suffix]};base64,{base64.b64encode(picture.read_bytes()).decode()}"
