@@ -37,7 +37,7 @@ class Command:
 
         from rich.console import Console
 
-        from ssa_nerfstudio.data.writing import staged_folder
+        from ssa_nerfstudio.data.writing import staged_folder, write_text
         from ssa_nerfstudio.evidence.capture_detection import as_json, cameras_of, detect_camera, write_detections
         from ssa_nerfstudio.evidence.detection import LEAST_VIEWS
 
@@ -59,7 +59,7 @@ class Command:
         with staged_folder(output) as folder:
             write_detections(folder, found)
             if self.json is not None:
-                _write(self.json, as_json(found))
+                write_text(self.json, as_json(found))
         for name, detection in found.items():
             low, high = detection.p_interval
             camera = f"{name}: " if len(found) > 1 else ""
@@ -73,14 +73,3 @@ class Command:
                 f"false alarms [{low:.3f}, {high:.3f}])"
             )
         console.print(f"{output}: evidence.png, and masks whose black is the artifact")
-
-
-def _write(path: Path, text: str) -> None:
-    """In place, not by renaming, because it may be /dev/stdout; of a new file nothing stays where it fails."""
-    new = not path.exists()
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        if new:
-            path.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written ({error})", "free space there or name another file") from error

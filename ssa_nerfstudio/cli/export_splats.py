@@ -47,6 +47,7 @@ class Command:
             )
         from rich.console import Console
 
+        from ssa_nerfstudio.data.writing import unwritable_as_input_error
         from ssa_nerfstudio.export.checkpoint import Checkpoint
         from ssa_nerfstudio.export.splats import select, within, write_compressed_ply, write_ply
 
@@ -56,15 +57,13 @@ class Command:
         selection = select(gaussians, inside)
         path = self.output_dir / self.output_filename
         console = Console(highlight=False, soft_wrap=True)
-        try:
+        with unwritable_as_input_error(path):
             self.output_dir.mkdir(parents=True, exist_ok=True)
             write_ply(path, gaussians, selection.kept, self.ply_color_mode)
             paths = [path]
             if self.compressed:
                 paths.append(path.with_suffix(".compressed.ply"))
                 write_compressed_ply(paths[1], gaussians, selection.kept)
-        except OSError as error:
-            raise InputError(f"{path} cannot be written ({error})", "name another --output-dir") from error
         for written in paths:
             console.print(f"{written}: {selection.kept.sum():,} Gaussians, {written.stat().st_size / 1e6:,.1f} MB")
         if selection.not_finite or selection.too_faint:

@@ -1,7 +1,9 @@
-"""A folder that appears only when it is complete."""
+"""Files and folders that appear only when they are complete."""
 
 from __future__ import annotations
 
+import os
+import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,22 +13,103 @@ from ssa_nerfstudio.errors import InputError
 
 
 @contextmanager
-def staged_folder(output: Path) -> Iterator[Path]:
-    """A hidden folder beside `output` to write into, renamed to `output` when the block ends well, else removed.
+def unwritable_as_input_error(path: Path) -> Iterator[None]:
+    """Turn an `OSError` of the block into an `InputError` that names the output.
+
+    Args:
+        path: the output as the user knows it, a file or a folder.
 
     Raises:
-        InputError: `output` exists, or cannot be written.
+        InputError: the block raised an `OSError`, for example because the disk is full.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error})", "free space there or choose another place") from error
+
+
+@contextmanager
+def staged_folder(output: Path) -> Iterator[Path]:
+    """Write a folder that appears when the block ends without an error, and not otherwise.
+
+    Args:
+        output: the folder to make. Its parents are made where missing.
+
+    Yields:
+        An empty hidden folder beside `output`, renamed to `output` at the end.
+
+    Raises:
+        InputError: `output` exists or cannot be written.
     """
     if output.exists():
-        raise InputError(f"{output} exists already", "remove it or name another folder with --output")
-    try:
+        raise InputError(f"{output} exists already", "remove it or choose another output folder")
+    with unwritable_as_input_error(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as scratch:
             folder = Path(scratch) / output.name
             folder.mkdir()
             yield folder
             folder.rename(output)
-    except OSError as error:
-        raise InputError(
-            f"{output} cannot be written ({error})", "free space there or name another --output"
-        ) from error
+
+
+@contextmanager
+def staged_file(path: Path) -> Iterator[Path]:
+    """Write a file that appears, or replaces an older one, when the block ends without an error.
+
+    One process at a time may write a file: two would share the temporary name. It is always the same, so that what a
+    killed process leaves behind is overwritten by the next attempt. It ends in `.part`, so libraries that choose a
+    format by suffix have to be told.
+
+    Args:
+        path: the file to write; its folder exists.
+
+    Yields:
+        The temporary path `.NAME.part` beside it.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+@contextmanager
+def staged_files(folder: Path, scratch: Path) -> Iterator[Path]:
+    """Write files that appear in a folder one after the other when the block ends without an error.
+
+    For readers that take every name in `folder` for a complete file. The data reach the disk before the names do: a
+    machine that loses power leaves no file with a name and without its data.
+
+    Args:
+        folder: where the files go; made where missing.
+        scratch: a folder on the same file system. It is emptied first and removed at the end.
+
+    Yields:
+        `scratch`, empty.
+    """
+    shutil.rmtree(scratch, ignore_errors=True)
+    scratch.mkdir(parents=True)
+    try:
+        yield scratch
+        for path in scratch.iterdir():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+            folder.mkdir(parents=True, exist_ok=True)
+            path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file at once; links, devices and pipes such as /dev/stdout are written in place.
+
+    Raises:
+        InputError: it cannot be written.
+    """
+    with unwritable_as_input_error(path):
+        if path.is_symlink() or (path.exists() and not path.is_file()):
+            path.write_text(text, encoding="utf-8")
+            return
+        with staged_file(path) as part:
+            part.write_text(text, encoding="utf-8")

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.errors import InputError
 
 LOWEST_OPACITY = -5.5373
@@ -90,15 +91,13 @@ def write_ply(
         *(f"property {kinds[values.dtype]} {name}" for names, values in blocks for name in names),
         "end_header",
     ]
-    unfinished = path.with_name(path.name + ".part")
-    with unfinished.open("wb") as file:
+    with staged_file(path) as part, part.open("wb") as file:
         file.write(("\n".join(header) + "\n").encode())
         for start in range(0, count, _ROWS):
             rows = np.empty(min(_ROWS, count - start), dtype=row)
             for number, (_, values) in enumerate(blocks):
                 rows[str(number)] = values[start : start + _ROWS]
             file.write(rows.data)
-    unfinished.replace(path)
 
 
 _ROWS = 8192
@@ -170,9 +169,8 @@ def write_compressed_ply(path: Path, gaussians: dict[str, Tensor], kept: np.ndar
         harmonics,
         rest if rest.shape[1] else None,
     )
-    unfinished = path.with_name(path.name + ".part")
-    unfinished.write_bytes(content)
-    unfinished.replace(path)
+    with staged_file(path) as part:
+        part.write_bytes(content)
 
 
 def _harmonics(gaussians: dict[str, Tensor]) -> np.ndarray:

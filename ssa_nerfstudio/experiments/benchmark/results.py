@@ -5,12 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.experiments.configuration import build
@@ -77,10 +77,9 @@ def write(result: Result, path: Path) -> None:
     """Writes a result; the file appears when it is complete."""
     values = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(result)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
-    # JSON has no infinity: the PSNR of equal pictures becomes null.
-    scratch.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    scratch.replace(path)
+    with staged_file(path) as part:
+        # JSON has no infinity: the PSNR of equal pictures becomes null.
+        part.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read(path: Path) -> Result:

@@ -1,0 +1,100 @@
+"""Files and folders appear whole or not at all."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from ssa_nerfstudio.data.writing import staged_file, staged_files, staged_folder, unwritable_as_input_error, write_text
+from ssa_nerfstudio.errors import InputError
+
+
+class Interrupted(Exception):
+    """As a signal would."""
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def test_a_folder_appears_at_the_end(tmp_path):
+    with staged_folder(tmp_path / "new" / "out") as folder:
+        (folder / "file").write_text("content")
+        assert not (tmp_path / "new" / "out").exists()
+    assert names(tmp_path) == ["new", "new/out", "new/out/file"]
+
+
+def test_nothing_of_a_folder_is_left_after_an_error(tmp_path):
+    with pytest.raises(Interrupted), staged_folder(tmp_path / "out") as folder:
+        (folder / "file").write_text("content")
+        raise Interrupted
+    assert names(tmp_path) == []
+
+
+def test_a_folder_that_exists_or_cannot_be_written_is_refused(tmp_path):
+    with pytest.raises(InputError, match="exists already; remove it"), staged_folder(tmp_path):
+        pass
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"file/out cannot be written \("), staged_folder(tmp_path / "file" / "out"):
+        pass
+
+
+def test_a_file_is_replaced_at_the_end_or_stays_as_it_was(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("old")
+    with pytest.raises(Interrupted), staged_file(path) as part:
+        part.write_text("half")
+        raise Interrupted
+    assert path.read_text() == "old"
+    with staged_file(path) as part:
+        part.write_text("new")
+        assert path.read_text() == "old"
+    assert path.read_text() == "new"
+    assert names(tmp_path) == ["file"]
+
+
+def test_what_a_killed_process_left_is_overwritten(tmp_path):
+    (tmp_path / ".file.part").write_text("half of an earlier attempt")
+    with staged_file(tmp_path / "file") as part:
+        part.write_text("new")
+    assert names(tmp_path) == ["file"]
+
+
+def test_several_files_appear_at_the_end_and_none_after_an_error(tmp_path):
+    folder, scratch = tmp_path / "folder", tmp_path / "scratch"
+    scratch.mkdir()
+    (scratch / "left by a killed process").write_text("")
+    with staged_files(folder, scratch) as staged:
+        (staged / "one").write_text("1")
+        (staged / "two").write_text("2")
+        assert not folder.exists()
+    assert names(tmp_path) == ["folder", "folder/one", "folder/two"]
+    with pytest.raises(Interrupted), staged_files(folder, scratch) as staged:
+        (staged / "three").write_text("3")
+        raise Interrupted
+    assert names(tmp_path) == ["folder", "folder/one", "folder/two"]
+
+
+def test_errors_of_the_system_name_the_output(tmp_path):
+    with (
+        pytest.raises(InputError, match="out cannot be written .*; free space there"),
+        unwritable_as_input_error(tmp_path / "out"),
+    ):
+        raise OSError(28, "No space left on device")
+    with pytest.raises(InputError, match="nowhere/a.json cannot be written"):
+        write_text(tmp_path / "nowhere" / "a.json", "{}")
+
+
+def test_text_goes_to_files_and_to_standard_output(tmp_path):
+    write_text(tmp_path / "a.json", "{}")
+    assert names(tmp_path) == ["a.json"]
+    program = "from pathlib import Path; from ssa_nerfstudio.data.writing import write_text;"
+    program += "write_text(Path('/dev/stdout'), 'text')"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout == "text"
+    with (tmp_path / "redirected").open("w") as file:
+        subprocess.run([sys.executable, "-c", program], stdout=file, check=True)
+    assert (tmp_path / "redirected").read_text() == "text"
