@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.alignment import center_errors
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.sources import read_source
-from ssa_nerfstudio.data.transforms import Dataset
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
@@ -50,7 +50,7 @@ def measure(
         photos, registered, points; and error, the root mean square of the camera centers' errors in percent of the mean
         distance of the true centers from their middle (not a number below 4 registered photos).
     """
-    source = read_source(photos, "frame", least=3)
+    source = read_source(photos, "frame", min_photos=3)
     found = {"photos": len(source.photos), "registered": 0, "points": 0, "error": float("nan")}
     with tempfile.TemporaryDirectory() as scratch:
         output = Path(scratch) / "dataset"

@@ -70,16 +70,16 @@ class Command:
         if self.output.exists():
             raise InputError(f"{self.output} exists already", "remove it or name another folder with --output")
         two = self.clean is not None
-        sources = [read_source(self.train, "train" if two else "frame", least=3)]
+        sources = [read_source(self.train, "train" if two else "frame", min_photos=3)]
         if self.clean is not None:
-            sources.append(read_source(self.clean, "clean", least=1))
+            sources.append(read_source(self.clean, "clean", min_photos=1))
         first = sources[0]
         mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
         settings = Settings(self.matching, self.max_image_size, self.flatten, self.filter_stationary, self.threads)
         console = Console(highlight=False, soft_wrap=True)
         for source in sources:
-            if source.left_out:
-                console.print(f"{source.path}: {len(source.left_out)} videos beside the photos are left out")
+            if source.skipped_videos:
+                console.print(f"{source.path}: {len(source.skipped_videos)} videos beside the photos are left out")
 
         outcome = process(sources, self.output, mask, self.detect, self.frames, self.min_registered, settings, console)
 

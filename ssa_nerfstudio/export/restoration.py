@@ -7,11 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from PIL import Image
 
-from ssa_nerfstudio.data.photos import read_photo
+from ssa_nerfstudio.data.photos import open_photo, read_photo, write_photo
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 
@@ -97,11 +96,8 @@ def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
     Raises:
         InputError: the photo is unreadable or of another aspect.
     """
-    try:
-        with Image.open(path) as image:
-            width, height = image.size
-    except (OSError, SyntaxError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as a photo ({error})", "copy it again or remove it") from error
+    with open_photo(path) as image:
+        width, height = image.size
     for layers in frames:
         if (layers.camera.width, layers.camera.height) == (width, height):
             return layers
@@ -142,11 +138,10 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
 
     def one(path: Path) -> Recovery:
         layers = sized[path]
-        photo = read_photo(path, layers.camera.width, layers.camera.height)
+        photo = read_photo(path, (layers.camera.width, layers.camera.height))
         clean, seen, implausible = restore(photo, layers)
         place = (output / "photos" / path.relative_to(folder)).with_suffix(".png")
-        place.parent.mkdir(parents=True, exist_ok=True)
-        cv2.imwrite(str(place), clean[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])
+        write_photo(place, clean)
         lower_bound = float((clipped(photo, layers) & seen).mean())
         return Recovery(path.relative_to(folder), float(1 - seen.mean()), implausible, lower_bound)
 

@@ -10,7 +10,9 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
 from nerfstudio.data.datasets.base_dataset import InputDataset
+from PIL import Image
 
+from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.view_geometry import prepare
 
@@ -18,24 +20,24 @@ TRAINING_REDUCTIONS = (1, 2, 4, 8)
 """Factors by which splatfacto's resolution schedule reduces photos, for which intrinsics are kept ready."""
 
 
-class NamedInputDataset(InputDataset):
-    """nerfstudio's dataset, whose errors say which file they mean."""
+class PhotoDataset(InputDataset):
+    """nerfstudio's dataset, with our decoder: pixels that it would misread are refused, and errors name the file."""
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
-        """Decode one photo: uint8 [H, W, 3 or 4].
+        """Decode one photo and scale it by `scale_factor`: uint8 [H, W, 3], or [H, W, 4] for RGBA.
 
         Raises:
-            InputError: with the file's name, where it cannot be decoded.
+            InputError: see `read_photo`.
         """
-        path = self.image_filenames[image_idx]
-        try:
-            return super().get_numpy_image(image_idx)
-        except FileNotFoundError as error:
-            raise InputError(f"{path} does not exist", "put the photo there or remove its frame") from error
-        except (OSError, SyntaxError, ValueError, AssertionError) as error:
-            raise InputError(
-                f"{path} cannot be read as a photo ({error})", "copy it again from its source or remove its frame"
-            ) from error
+        cameras = self._dataparser_outputs.cameras  # unlike self.cameras as they were before any scaling
+        size = int(cameras.width[image_idx]), int(cameras.height[image_idx])
+        scaled = self.scale_factor != 1.0
+        photo = read_photo(self.image_filenames[image_idx], None if scaled else size, alpha=True)
+        if not scaled:
+            return photo
+        image = Image.fromarray(photo)
+        size = int(image.width * self.scale_factor), int(image.height * self.scale_factor)
+        return np.array(image.resize(size, Image.Resampling.BILINEAR))
 
 
 @dataclass
@@ -47,7 +49,7 @@ class SSADatamanagerConfig(FullImageDatamanagerConfig):
     """Type of the cached photos; uint8 is exact for 8-bit photos and a quarter of the memory."""
 
 
-class SSADatamanager(FullImageDatamanager[NamedInputDataset]):
+class SSADatamanager(FullImageDatamanager[PhotoDataset]):
     """`FullImageDatamanager` that also works without CUDA, names unreadable files, and prepares its cameras once."""
 
     config: SSADatamanagerConfig

@@ -1,4 +1,4 @@
-"""The mask of an opaque artifact that detection finds in the photos of a pass."""
+"""A mask of the opaque artifact that detection finds in the photos of a pass."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ssa_nerfstudio.data.photos import read_photo
+
 _SIZE = 960
-"""Longest side of the photos that detection looks at, pixels: twice its working resolution."""
+"""Longest side to which photos are reduced for detection, pixels: twice its working resolution."""
 
 
-def detected_mask(photos: Sequence[Path], on_photo: Callable[[int], None]) -> np.ndarray | None:
-    """Where no opaque artifact is.
+def detected_mask(photos: Sequence[Path], advance: Callable[[int], None]) -> np.ndarray | None:
+    """Detect an opaque artifact and mask it.
 
-    What light shines through is not masked: behind mud or rain that would hide the scene, too.
+    Semi-transparent artifacts are not masked: a mask of mud or rain would hide the scene behind it, too.
 
     Args:
         photos: files of one size, in the order of the capture.
-        on_photo: called with how many have been read.
+        advance: called with the number of photos read so far.
 
     Returns:
-        bool [H, W] of the photos' size, True where features may lie; None where there is no opaque artifact.
+        bool [H, W] of the photos' size, True where features may lie; None where no opaque artifact is found.
     """
     import torch
 
@@ -32,13 +34,13 @@ def detected_mask(photos: Sequence[Path], on_photo: Callable[[int], None]) -> np
     statistics = ImageStatistics()
     size = 0, 0
     for number, path in enumerate(photos, 1):
-        photo = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        photo = read_photo(path)
         size = photo.shape[1], photo.shape[0]
         if (scale := _SIZE / max(size)) < 1:
             reduced = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
             photo = cv2.resize(photo, reduced, interpolation=cv2.INTER_AREA)
-        statistics.add(torch.from_numpy(cv2.cvtColor(photo, cv2.COLOR_BGR2RGB)))
-        on_photo(number)
+        statistics.add(torch.from_numpy(photo))
+        advance(number)
     found = detect(statistics)
     if found.verdict != "opaque":
         return None

@@ -19,8 +19,8 @@ from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.detected_mask import detected_mask
 from ssa_nerfstudio.sfm.feature_mask import widened
-from ssa_nerfstudio.sfm.flat_field import LEAST_PHOTOS, static_factor, write_flattened
-from ssa_nerfstudio.sfm.ingest import Photo, expected, ingest
+from ssa_nerfstudio.sfm.flat_field import MIN_PHOTOS, static_factor, write_flattened
+from ssa_nerfstudio.sfm.ingest import Photo, expected_count, ingest
 from ssa_nerfstudio.sfm.nerfstudio_dataset import POINTS, split, transforms, write_points
 from ssa_nerfstudio.sfm.reconstruction import Pass, Report, Settings, reconstruct
 from ssa_nerfstudio.sfm.resumable_work import Work, resumable_work
@@ -153,23 +153,23 @@ def _load(model: Path) -> pycolmap.Reconstruction:
 
 
 def _ingest(sources: Sequence[Source], dataset: Path, frames: int, report: Report) -> list[list[Photo]]:
-    total = sum(expected(source, frames) for source in sources)
+    total = sum(expected_count(source, frames) for source in sources)
     done = 0
 
-    def on_photo() -> None:
+    def advance() -> None:
         nonlocal done
         done += 1
         report("photos", min(done, total), total)
 
     report("photos", 0, total)
-    photos = [ingest(source, dataset, frames, on_photo) for source in sources]
+    photos = [ingest(source, dataset, frames, advance) for source in sources]
     report("photos", total, total)
     return photos
 
 
 def _flatten(names: list[str], images: Path, folder: Path, settings: Settings, report: Report) -> Path:
     """Folder of the photos without what is the same in all of them: their own where nothing is, or it is not asked."""
-    if not settings.flatten or len(names) < LEAST_PHOTOS:
+    if not settings.flatten or len(names) < MIN_PHOTOS:
         return images
     done = sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
     if done < len(names):

@@ -14,7 +14,7 @@ from small_captures import write
 
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.sfm.image_pairs import exhaustive_pairs, sequential_pairs
-from ssa_nerfstudio.sfm.ingest import expected, ingest
+from ssa_nerfstudio.sfm.ingest import expected_count, ingest
 
 
 def gradient(width: int = 64, height: int = 48) -> np.ndarray:
@@ -26,11 +26,11 @@ def gradient(width: int = 64, height: int = 48) -> np.ndarray:
 def brought_in(folder: Path, frames: int = 10) -> tuple[Path, list[str]]:
     dataset = folder.parent / "dataset"
     dataset.mkdir()
-    source = read_source(folder, "frame", least=1)
+    source = read_source(folder, "frame", min_photos=1)
     calls: list[int] = []
     photos = ingest(source, dataset, frames, lambda: calls.append(1))
     assert len(calls) == len(photos)
-    assert len(photos) == expected(source, frames)
+    assert len(photos) == expected_count(source, frames)
     return dataset, [photo.source for photo in photos]
 
 
@@ -52,7 +52,7 @@ def test_photos_are_stored_as_they_are_to_be_looked_at(suffix, orientation, tmp_
     exif[ExifTags.Base.Orientation] = orientation
     exif[ExifTags.Base.Make] = "maker"
     write(tmp_path / "photos", [gradient()] * 2, suffix, exif=exif)
-    source = read_source(tmp_path / "photos", "frame", least=1)
+    source = read_source(tmp_path / "photos", "frame", min_photos=1)
     dataset, _ = brought_in(tmp_path / "photos")
     stored = Image.open(dataset / f"images/frame_00001{suffix}")
     assert stored.getexif().get(ExifTags.Base.Orientation, 1) == 1
@@ -119,8 +119,8 @@ def test_a_folder_of_videos_is_one_sequence_and_a_short_one_gives_all_its_frames
 def test_videos_beside_photos_are_left_out(tmp_path):
     write(tmp_path / "photos", [gradient()] * 3)
     write_video(tmp_path / "photos/photo_1.avi", 3, set())
-    source = read_source(tmp_path / "photos", "frame", least=3)
-    assert [path.name for path in source.left_out] == ["photo_1.avi"]
+    source = read_source(tmp_path / "photos", "frame", min_photos=3)
+    assert [path.name for path in source.skipped_videos] == ["photo_1.avi"]
     assert len(source.photos) == 3
 
 

@@ -69,7 +69,7 @@ def test_mud_all_over_the_frame(tmp_path, draw_effect, photos):
     layers = draw_effect("mud", HEIGHT, WIDTH)
     folder = write(tmp_path / "photos", [layers.apply(photo) for photo in photos(24)])
     true = poses(24)[:, :3, 3]
-    source = read_source(folder, "frame", least=3)
+    source = read_source(folder, "frame", min_photos=3)
     outcome = process([source], tmp_path / "out", settings=Settings(threads=1))
     assert outcome.passes[0].count >= 0.9 * 24
     assert _error(tmp_path / "out", true) < 0.03
