@@ -18,8 +18,7 @@ from rich.console import Console
 from rich.progress import track
 
 from ssa_nerfstudio.cameras.lens import undistort
-from ssa_nerfstudio.data.photos import read_photo
-from ssa_nerfstudio.data.transforms import Dataset, View
+from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.experiments.effects.composition import Composition
@@ -86,7 +85,7 @@ def rates(
 
 
 def _read(dataset: Dataset, view: View) -> np.ndarray:
-    return np.array(read_photo(dataset.source(view.path), view.lens.width, view.lens.height))
+    return dataset.read_photo(view)
 
 
 def _behind(scene: Scene, artifact: Composition, photo: np.ndarray, number: int) -> np.ndarray:

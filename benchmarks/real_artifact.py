@@ -18,7 +18,7 @@ import tyro
 from PIL import Image
 
 from ssa_nerfstudio.cameras.lens import undistort
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.experiments.runs.training_run import configure, model_settings, train_and_evaluate
 from ssa_nerfstudio.metrics.image import matte_iou
 

@@ -14,8 +14,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from ssa_nerfstudio.data.photos import read_photo, write_photo
-from ssa_nerfstudio.data.transforms import Dataset, View
+from ssa_nerfstudio.data.dataset import Dataset, View
+from ssa_nerfstudio.data.photos import write_photo
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
@@ -53,7 +53,7 @@ def measure(
 
 def _round_trip(dataset: Dataset, views: list[View], folder: Path, threads: int) -> None:
     def work(view: View) -> None:
-        photo = read_photo(dataset.source(view.path), view.lens.width, view.lens.height)
+        photo = dataset.read_photo(view)
         write_photo(folder / PurePosixPath(view.path).with_suffix(".png"), photo)
 
     with ThreadPoolExecutor(threads) as pool:

@@ -29,9 +29,10 @@ class Command:
         if self.steps < 1 or not 0 < self.scale_factor <= 1:
             raise InputError("--steps must be at least 1 and --scale-factor in (0, 1]")
         if self.data is not None:
-            from ssa_nerfstudio.plugin.validation import check_transforms
+            from ssa_nerfstudio.data.training_requirements import check_training
+            from ssa_nerfstudio.data.transforms import Transforms
 
-            check_transforms(self.data)
+            check_training(Transforms.read(self.data))
         console = Console()
         console.print("Loading nerfstudio ...")
         from ssa_nerfstudio.experiments.demo import comparison as run

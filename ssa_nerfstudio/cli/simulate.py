@@ -40,15 +40,15 @@ class Command:
         """
         from rich.console import Console
 
-        from ssa_nerfstudio.data.transforms import Dataset
+        from ssa_nerfstudio.data.dataset import Dataset
         from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects, read_scene
         from ssa_nerfstudio.experiments.simulation.simulator import simulate
 
         if (self.effects is None) == (self.scene is None):
             raise InputError("say what to simulate: either --effects NAME ... or --scene NAME")
-        for name, lowest in (("seed", 0), ("threads", 1)):
+        for name, lowest in (("seed", 0), ("threads", 1), ("eval_interval", 2), ("downscale_factor", 1)):
             if (value := getattr(self, name)) is not None and value < lowest:
-                raise InputError(f"--{name} must be at least {lowest}, got {value}")
+                raise InputError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
         scene = Scene(read_effects(self.effects)) if self.effects is not None else read_scene(str(self.scene))
         if self.seed is not None:
             scene = dataclasses.replace(scene, seed=self.seed)

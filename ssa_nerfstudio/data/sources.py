@@ -45,7 +45,7 @@ class Source:
         """Sharp frames of all videos in order, from each as many as its share of all frames.
 
         Args:
-            count: about how many in all, at min_photos 1.
+            count: about how many in all, at least 1.
 
         Yields:
             The video, the frame's number in it, from 0, and the frame, BGR uint8 [height, width, 3], upright.
@@ -62,18 +62,17 @@ class Source:
 
 
 def read_source(path: Path, name: str, min_photos: int) -> Source:
-    """Finds the photos or videos of one pass and checks that one camera can have taken them all.
+    """Find the photos or videos of one pass and check that one camera can have taken them all.
 
-    Photos are opened, not decoded. Hidden files are passed over, and videos that lie beside photos (phones store
-    moving copies of photos) are left out.
+    Photos are opened, not decoded. Hidden files and videos beside photos are skipped.
 
     Args:
-        path: a folder of photos or of videos (subfolders are not searched), or one video.
+        path: a folder of photos or of videos, without its subfolders, or one video.
         name: what the dataset calls this pass.
-        min_photos: photos that are needed, at min_photos 1.
+        min_photos: how many photos are needed, at least 1.
 
     Raises:
-        InputError: nothing usable is there, a file cannot be read, sizes or orientations differ.
+        InputError: the folder holds nothing usable, a file cannot be read, or sizes or orientations differ.
     """
     if not path.exists():
         raise InputError(f"{path} does not exist", "give a folder of photos, a folder of videos or a video")

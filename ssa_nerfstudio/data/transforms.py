@@ -1,229 +1,248 @@
-"""A nerfstudio dataset as its transforms.json tells it: views, lenses and the split into training and test."""
+"""transforms.json, the file that makes a folder a nerfstudio dataset: read and validated in one place.
+
+What nerfstudio accepts is accepted: numbers as strings, intrinsics per frame, photos in images_N.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
-from ssa_nerfstudio.cameras.lens import Lens, undistorted
+import numpy as np
+
+from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.errors import InputError
 
 Kind = Literal["images", "masks", "depths"]
-"""Folders whose copies of 1 / N of the size nerfstudio finds in images_N, masks_N and depths_N."""
-_FISHEYE = {"OPENCV_FISHEYE"}
-_PERSPECTIVE = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+"""Kinds of files whose copies at 1 / N of the size nerfstudio finds in images_N, masks_N and depths_N."""
+Split = Literal["train", "val", "test"]
+"""nerfstudio's splits; the key in transforms.json is NAME_filenames."""
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+FILE_KEYS: dict[str, Kind] = {"file_path": "images", "mask_path": "masks", "depth_file_path": "depths"}
+"""Keys of a frame that name a file."""
+PERSPECTIVE_MODELS = {"SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"}
+"""Values of camera_model that nerfstudio treats alike: OpenCV's pinhole camera."""
+FISHEYE_MODELS = {"OPENCV_FISHEYE"}
+OTHER_MODELS = {
+    "EQUIRECTANGULAR",
+    "OMNIDIRECTIONALSTEREO_L",
+    "OMNIDIRECTIONALSTEREO_R",
+    "VR180_L",
+    "VR180_R",
+    "ORTHOPHOTO",
+    "FISHEYE624",
+}
+"""The rest of what nerfstudio knows. Splatfacto cannot undistort most of them."""
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
-_COMPANIONS: tuple[tuple[Kind, str], ...] = (("masks", "mask_path"), ("depths", "depth_file_path"))
-_COLMAP_MODEL = "colmap/sparse/0"
-_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+_MAX_FLOAT32 = float(np.finfo(np.float32).max)
+_MAX_SIZE = 2**31 - 1
 
 
 @dataclass(frozen=True)
-class View:
-    """One photo of the dataset."""
+class Intrinsics:
+    """The camera of one frame, as transforms.json states it for the photos of full size."""
 
-    path: str
-    """As transforms.json states it, relative to the dataset."""
-    role: Literal["train", "test", "unused"]
-    """Test includes validation; nerfstudio never opens an unused view."""
-    lens: Lens
-    """The raw frame, at the resolution that is read."""
-    companions: tuple[tuple[Kind, str], ...]
-    """Mask and depth map that belong to it, with their paths as transforms.json states them."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of the raw frame, pixels."""
-        return self.lens.height, self.lens.width
+    width: int
+    height: int
+    fx: float
+    """Focal length along x, pixels; positive."""
+    fy: float
+    cx: float
+    """Principal point, pixels from the left edge."""
+    cy: float
+    distortion: tuple[float, ...]
+    """k1, k2, k3, k4, p1, p2; other camera models have other numbers of coefficients."""
 
 
 @dataclass(frozen=True)
-class Dataset:
-    """A dataset at one resolution, read from its transforms.json; photos are not opened."""
+class Transforms:
+    """A transforms.json whose structure and intrinsics are valid. No photo has been opened."""
 
-    root: Path
-    """Folder that file paths are relative to."""
+    path: Path
+    """The .json file."""
     meta: dict[str, Any]
-    """transforms.json."""
-    downscale_factor: int
-    """N where photos are read from images_N (masks from masks_N, depths from depths_N), else 1."""
-    eval_interval: int
-    """Every so many views one is a test view, in sorted order, where transforms.json states no split."""
+    """Its contents."""
 
     @classmethod
-    def read(cls, data: Path, eval_interval: int, downscale_factor: int = 1) -> Dataset:
-        """Reads transforms.json and checks all that can be checked without opening a photo.
+    def read(cls, data: Path) -> Transforms:
+        """Read the file and check what every use of it needs: frames with file names, camera model and intrinsics.
 
         Args:
             data: the dataset's folder, or its .json file.
-            eval_interval: at least 2.
-            downscale_factor: at least 1.
 
         Raises:
-            InputError: transforms.json is missing or broken, a photo is missing, or the split cannot be used.
+            InputError: the file is missing, no JSON, or one of these is missing or wrong.
         """
         path = data if data.suffix == ".json" else data / "transforms.json"
         if not path.is_file():
-            raise InputError(f"{path} does not exist", "give --data a folder that ns-process-data made")
-        if eval_interval < 2:
-            raise InputError(f"--eval-interval must be at least 2, got {eval_interval}", "8 tests every 8th photo")
-        if downscale_factor < 1:
-            raise InputError(f"--downscale-factor must be at least 1, got {downscale_factor}", "2 reads images_2")
+            raise InputError(f"{path} does not exist", "choose a folder that ns-process-data or ssa process made")
         try:
             meta = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"{path} is no valid JSON ({error})", "write it again with ns-process-data") from error
-        frames = meta.get("frames") if isinstance(meta, dict) else None
-        if not isinstance(frames, list) or not all(
-            isinstance(frame, dict) and isinstance(frame.get("file_path"), str) for frame in frames
-        ):
-            raise InputError(
-                f"{path} has no list 'frames' of photos with a file_path", "write it again with ns-process-data"
-            )
-        dataset = cls(path.parent, meta, downscale_factor, eval_interval)
-        dataset._check(path)
-        return dataset
-
-    @cached_property
-    def views(self) -> list[View]:
-        """All views in nerfstudio's order, which is that of their paths."""
-        frames = sorted(self.meta["frames"], key=lambda frame: Path(frame["file_path"]))
-        train, val, test = self.split
-        roles: dict[str, Literal["train", "test"]] = dict.fromkeys(train, "train")
-        roles |= dict.fromkeys([*val, *test], "test")
-        return [
-            View(
-                path=frame["file_path"],
-                role=roles.get(frame["file_path"], "unused"),
-                lens=self._lens(frame),
-                companions=tuple((kind, frame[key]) for kind, key in _COMPANIONS if key in frame),
-            )
-            for frame in frames
-        ]
-
-    @cached_property
-    def split(self) -> tuple[list[str], list[str], list[str]]:
-        """Paths of training, validation and test views.
-
-        As transforms.json has them, what is missing there completed: validation and test stand for one another, and
-        the remaining views are training views. Where it has none, nerfstudio's interval split: in sorted order the
-        views 0, n, 2n, ... are for both validation and test, the others for training.
-        """
-        paths = sorted((frame["file_path"] for frame in self.meta["frames"]), key=Path)
-        given = {name: self._known(name, paths) for name in _SPLITS if name in self.meta}
-        if self.split_by_interval:
-            test = paths[:: self.eval_interval]
-            return _without(paths, test), test, test
-        train = given.get("train_filenames")
-        val = given.get("val_filenames", given.get("test_filenames"))
-        test = given.get("test_filenames", val)
-        if train is None:
-            train = _without(paths, [*(val or []), *(test or [])])
-        if val is None or test is None:
-            val = test = _without(paths, train)
-        return train, val, test
+        result = cls(path, meta)
+        result._check_frames()
+        result._check_cameras()
+        return result
 
     @property
-    def split_by_interval(self) -> bool:
-        """Whether transforms.json states no split."""
-        return not any(name in self.meta for name in _SPLITS)
+    def root(self) -> Path:
+        """Folder that file names are relative to."""
+        return self.path.parent
 
     @property
-    def points(self) -> list[str]:
-        """Files of the sparse points, relative to `root`.
+    def frames(self) -> list[dict[str, Any]]:
+        """The frames in the order of the file. nerfstudio sorts them by path."""
+        return self.meta["frames"]
 
-        Where an older dataset lacks the .ply or the transform that was applied, nerfstudio looks at COLMAP's model.
+    @property
+    def camera_model(self) -> str:
+        """Which lens model the intrinsics are of; one for all frames."""
+        return self.meta.get("camera_model", "OPENCV")
+
+    def intrinsics(self, frame: dict[str, Any]) -> Intrinsics:
+        """Intrinsics of one frame; what the file states for all frames takes precedence, as in nerfstudio.
+
+        Raises:
+            ValueError: a value is missing, no number, not finite or out of range.
         """
-        stated = [self.meta["ply_file_path"]] if "ply_file_path" in self.meta else []
-        if stated and "applied_transform" in self.meta:
-            return stated
-        model = sorted(path for path in (self.root / _COLMAP_MODEL).glob("*") if path.is_file())
-        return stated + [f"{_COLMAP_MODEL}/{path.name}" for path in model]
 
-    def source(self, path: str, kind: Kind = "images") -> Path:
-        """File of a photo, mask or depth map at the resolution that is read, found as nerfstudio finds it."""
-        if self.downscale_factor == 1:
-            return self.root / path
-        return self.root / f"{kind}_{self.downscale_factor}" / PurePosixPath(path).name
-
-    def _known(self, split: str, paths: list[str]) -> list[str]:
-        """The frames' own spelling of the names in a list of transforms.json."""
-        spelling = {Path(path): path for path in paths}
-        if not isinstance(self.meta[split], list) or not all(isinstance(name, str) for name in self.meta[split]):
-            raise InputError(f"{self.root}/transforms.json: {split} must be a list of file paths", "mend or remove it")
-        for name in self.meta[split]:
-            if Path(name) not in spelling:
-                raise InputError(
-                    f"{self.root}/transforms.json: {split} has {name}, which no frame is", "remove it there"
-                )
-        return [spelling[Path(name)] for name in self.meta[split]]
-
-    def _lens(self, frame: dict[str, Any]) -> Lens:
         def value(key: str) -> float:
             if key not in self.meta and key not in frame:
                 raise ValueError(f"{key} is missing")
             return float(self.meta[key] if key in self.meta else frame[key])
 
-        model = self.meta.get("camera_model", "OPENCV")
         # nerfstudio takes all of the distortion from one place, and does not look for k4 to find it.
         stated = {*_DISTORTION, "distortion_params"} - {"k4"}
-        source = self.meta if stated & self.meta.keys() else frame
-        distortion = tuple(source.get("distortion_params") or (source.get(key, 0.0) for key in _DISTORTION))
-        if model not in _FISHEYE | _PERSPECTIVE and any(distortion):
-            raise ValueError(f"camera_model {model} with distortion is none that splatfacto trains on")
-        n = self.downscale_factor
-        return Lens(
-            width=int(value("w") / n),
-            height=int(value("h") / n),
-            fx=value("fl_x") / n,
-            fy=value("fl_y") / n,
-            cx=value("cx") / n,
-            cy=value("cy") / n,
-            distortion=tuple(float(number) for number in distortion),
-            model="fisheye" if model in _FISHEYE else "perspective",
-        )
+        holder = self.meta if stated & self.meta.keys() else frame
+        distortion = tuple(holder.get("distortion_params") or (holder.get(key, 0.0) for key in _DISTORTION))
+        numbers = {key: value(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
+        coefficients = tuple(float(number) for number in distortion)
+        for key, number in [*numbers.items(), *(("distortion", number) for number in coefficients)]:
+            if not abs(number) <= _MAX_FLOAT32:
+                raise ValueError(f"intrinsics must be finite, {key} is {number}")
+        width, height, fx, fy, cx, cy = numbers.values()
+        if not (1 <= width <= _MAX_SIZE and 1 <= height <= _MAX_SIZE):
+            raise ValueError(f"frame must be at least 1 x 1 pixels, got {width:g} x {height:g}")
+        if fx <= 0 or fy <= 0:
+            raise ValueError(f"focal lengths must be positive, got {fx:g} and {fy:g}")
+        return Intrinsics(int(width), int(height), fx, fy, cx, cy, coefficients)
 
-    def _check(self, path: Path) -> None:
-        for frame in self.meta["frames"]:
-            try:
-                undistorted(self._lens(frame))
-            except (TypeError, ValueError) as error:
-                raise InputError(
-                    f"{path}: camera of {frame['file_path']}: {error}", "process the photos again"
-                ) from error
+    def lens(self, frame: dict[str, Any], downscale_factor: int = 1) -> Lens:
+        """The raw frame's lens at the resolution that is read.
+
+        Raises:
+            ValueError: see `intrinsics`; or nerfstudio cannot undistort photos of such a lens.
+        """
+        i, n = self.intrinsics(frame), downscale_factor
+        if any(i.distortion) and self.camera_model not in PERSPECTIVE_MODELS | FISHEYE_MODELS:
+            raise ValueError(f"camera_model {self.camera_model} with distortion is none that splatfacto trains on")
+        distortion = i.distortion if any(i.distortion) else (0.0,) * 6
+        model = "fisheye" if self.camera_model in FISHEYE_MODELS else "perspective"
+        return Lens(int(i.width / n), int(i.height / n), i.fx / n, i.fy / n, i.cx / n, i.cy / n, distortion, model)
+
+    def source(self, name: str, kind: Kind = "images", downscale_factor: int = 1) -> Path:
+        """File of a photo, mask or depth map, found as nerfstudio finds it.
+
+        Args:
+            name: the path that transforms.json states.
+            kind: what it is.
+            downscale_factor: N > 1 reads images_N.
+        """
+        if downscale_factor == 1:
+            return self.root / name
+        return self.root / f"{kind}_{downscale_factor}" / PurePosixPath(name).name
+
+    def stated_split(self, split: Split) -> list[str] | None:
+        """Frames of a split, as their frames spell them; None where the file does not state it.
+
+        Raises:
+            InputError: it is no list of file names, or names a frame that does not exist.
+        """
+        key = f"{split}_filenames"
+        if key not in self.meta:
+            return None
+        names = self.meta[key]
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise InputError(f"{self.path}: {key} must be a list of file paths", "correct or remove it")
+        spelling = {Path(frame["file_path"]): frame["file_path"] for frame in self.frames}
+        for name in names:
+            if Path(name) not in spelling:
+                raise InputError(f"{self.path}: {key} has {name}, which no frame is", "remove it there")
+        return [spelling[Path(name)] for name in names]
+
+    def check_exist(self, names: Iterable[str], kind: Kind = "images", downscale_factor: int = 1) -> None:
+        """Check that photos or masks exist.
+
+        Args:
+            names: paths that transforms.json states.
+            kind: what they are.
+            downscale_factor: N > 1 looks in images_N.
+
+        Raises:
+            InputError: one does not exist.
+        """
+        for name in names:
+            path = self.source(name, kind, downscale_factor)
+            if not is_file(path):
+                what = "mask" if kind == "masks" else "photo"
+                raise InputError(f"{path} does not exist", f"put the {what} there or remove its frame")
+
+    def check_copyable(self, others: Iterable[object] = ()) -> None:
+        """Check what a copy of the dataset needs beyond training: each frame once, and all files inside the folder.
+
+        Args:
+            others: further names of files in the folder.
+
+        Raises:
+            InputError: it is not so.
+        """
         seen = set()
-        for photo in (Path(frame["file_path"]) for frame in self.meta["frames"]):
+        for photo in (Path(frame["file_path"]) for frame in self.frames):
             if photo in seen:
-                raise InputError(f"{path} has two frames of {photo}", "remove one")
+                raise InputError(f"{self.path} has two frames of {photo}", "remove one")
             seen.add(photo)
-        train, val, test = self.split
-        for both in sorted({*train} & {*val, *test}):
-            raise InputError(f"{path}: {both} is both training and test view", "test views stay clean, list it once")
-        if not train:
-            raise InputError(f"{path} leaves no photo to train on", "add photos or hold fewer back for evaluation")
-        names = [name for view in self.views for name in (view.path, *(name for _, name in view.companions))]
-        for name in [*names, *self.points]:
+        for name in [*(frame[key] for frame in self.frames for key in FILE_KEYS if key in frame), *others]:
             if not isinstance(name, str):
-                raise InputError(f"{path}: {name!r} stands where a file's path is expected", "mend or remove it")
+                raise InputError(
+                    f"{self.path}: {name!r} stands where a file's path is expected", "correct or remove it"
+                )
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
                 raise InputError(
-                    f"{path}: {name} lies outside the dataset", "put it inside and state its relative path"
+                    f"{self.path}: {name} lies outside the dataset", "put it inside and state its relative path"
                 )
-        for view in self.views:
-            if not _is_file(self.source(view.path)):
-                raise InputError(f"{self.source(view.path)} does not exist", "put the photo there or remove its frame")
+
+    def _check_frames(self) -> None:
+        problem = f"{self.path} has no list 'frames' of objects with a file_path"
+        frames = self.meta.get("frames") if isinstance(self.meta, dict) else None
+        if not isinstance(frames, list):
+            raise InputError(problem, "write it again with ns-process-data")
+        for frame in frames:
+            if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+                raise InputError(f"{problem}: the frame {frame!r:.100} is none", "correct or remove it")
+
+    def _check_cameras(self) -> None:
+        known = PERSPECTIVE_MODELS | FISHEYE_MODELS | OTHER_MODELS
+        if not isinstance(self.camera_model, str) or self.camera_model not in known:
+            raise InputError(
+                f"{self.path}: camera_model {self.camera_model!r} is none of {', '.join(sorted(known))}",
+                "correct it, or remove it where photos are from a perspective camera",
+            )
+        for frame in self.frames:
+            try:
+                self.intrinsics(frame)
+            except (TypeError, ValueError) as error:
+                raise InputError(
+                    f"{self.path}: camera of {frame['file_path']}: {error}", "correct it or process the photos again"
+                ) from error
 
 
-def _is_file(path: Path) -> bool:
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; False where the name can be none."""
     try:
         return path.is_file()
-    except OSError:  # no path: too long
+    except OSError:  # a name that is too long
         return False
-
-
-def _without(paths: list[str], others: list[str]) -> list[str]:
-    excluded = {*others}
-    return [path for path in paths if path not in excluded]

@@ -12,20 +12,20 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from PIL import Image, ImageOps
+from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
 from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.photos import read_photo
-from ssa_nerfstudio.data.sources import Source, open_photo, read_source
-from ssa_nerfstudio.data.transforms import Dataset, View
+from ssa_nerfstudio.data.sources import Source, read_source
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import DRAWS, EVIDENCE_NEEDED, Detection, detect
 from ssa_nerfstudio.evidence.statistics import accumulate
 
-LEAST_PHOTOS = 2
+MIN_PHOTOS = 2
 """What stays the same in all photos takes more than one to see."""
 
 
@@ -38,7 +38,7 @@ class Camera:
     count: int
     """How many there are, about."""
     photos: Callable[[int], Iterator[np.ndarray]]
-    """Decodes them in their order, so many at once: uint8 [H, W, 3], read-only use."""
+    """Decodes them in their order, so many at once: uint8 [H, W, 3]."""
 
 
 def cameras_of(data: Path, frames: int) -> list[Camera]:
@@ -53,10 +53,12 @@ def cameras_of(data: Path, frames: int) -> list[Camera]:
     """
     if data.suffix == ".json" or (data / "transforms.json").is_file():
         return _of_dataset(Dataset.read(data, eval_interval=8), data)
-    source = read_source(data, "frame", least=LEAST_PHOTOS)
+    source = read_source(data, "frame", min_photos=MIN_PHOTOS)
     if source.videos:
         return [Camera("camera-1", frames, lambda _: _frames(source, frames))]
-    return [Camera("camera-1", len(source.photos), partial(ordered_map, _read_upright, source.photos))]
+    return [
+        Camera("camera-1", len(source.photos), partial(ordered_map, partial(read_photo, upright=True), source.photos))
+    ]
 
 
 def detect_camera(camera: Camera, threads: int, console: Console | None = None, draws: int = DRAWS) -> Detection:
@@ -74,7 +76,7 @@ def detect_camera(camera: Camera, threads: int, console: Console | None = None, 
     photos = track(
         camera.photos(threads), camera.name, camera.count, transient=True, console=console, disable=console is None
     )
-    return detect(accumulate((torch.from_numpy(np.require(photo, requirements="W")), None) for photo in photos), draws)
+    return detect(accumulate((torch.from_numpy(photo), None) for photo in photos), draws)
 
 
 def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = None) -> dict[str, Detection]:
@@ -139,34 +141,21 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
     lenses = [(v.lens.width, v.lens.height, v.lens.fx, v.lens.fy, v.lens.cx, v.lens.cy) for v in views]
     groups = group_frames(np.array(lenses, dtype=np.float64))
 
-    def read(view: View) -> np.ndarray:
-        return read_photo(dataset.source(view.path), view.lens.width, view.lens.height)
-
     cameras = []
     for group in range(max(groups) + 1):
         members = [view for view, at in zip(views, groups, strict=True) if at == group]
-        if len(members) < LEAST_PHOTOS:
+        if len(members) < MIN_PHOTOS:
             raise InputError(
                 f"{data}: {members[0].path} is the only photo of its camera",
-                f"what stays the same takes {LEAST_PHOTOS} to see: add photos or take it out",
+                f"what stays the same takes {MIN_PHOTOS} to see: add photos or take it out",
             )
-        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(ordered_map, read, members)))
+        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(ordered_map, dataset.read_photo, members)))
     return cameras
 
 
 def _frames(source: Source, frames: int) -> Iterator[np.ndarray]:
-    total = sum(video.frames for video in source.videos)
-    for video in source.videos:
-        for _, picture in video.sharpest(max(1, round(frames * video.frames / total))):
-            yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
-
-
-def _read_upright(photo: Path) -> np.ndarray:
-    with open_photo(photo) as image:
-        try:
-            return np.array(ImageOps.exif_transpose(image).convert("RGB"))
-        except (OSError, SyntaxError, ValueError) as error:
-            raise InputError(f"{photo} is broken ({error})", "copy it again from its source or take it out") from error
+    for _, _, picture in source.video_frames(frames):
+        yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
 def _evidence_picture(detection: Detection) -> np.ndarray:

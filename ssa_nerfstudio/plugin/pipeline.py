@@ -11,12 +11,14 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from ssa_nerfstudio.data.training_requirements import check_training
+from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.plugin.camera_matching import describe_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.training.checkpoints import saved_pipeline
-from ssa_nerfstudio.plugin.validation import check_device, check_settings, check_transforms, check_views
+from ssa_nerfstudio.plugin.validation import check_device, check_settings, check_views
 
 
 @dataclass
@@ -53,7 +55,8 @@ class SSAPipeline(VanillaPipeline):
         check_settings(config.model, device)
         source = _source(config)
         if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
-            check_transforms(source)
+            splits = ("train", "val" if test_mode == "val" else "test")
+            check_training(Transforms.read(source), config.datamanager.dataparser.downscale_factor, splits)
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
         check_views(self.datamanager.train_dataparser_outputs, source)
         if test_mode == "val":

@@ -1,23 +1,18 @@
-"""Checks of what the user hands over, before anything is built: each failure is one line and exit code 2."""
+"""Checks of a training's inputs before anything is built; transforms.json is checked in `data`."""
 
 from __future__ import annotations
 
-import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
 import torch
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+from ssa_nerfstudio.data.training_requirements import MIN_VIEWS
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
     from ssa_nerfstudio.plugin.settings import ModelSettings
-
-MIN_VIEWS = 2
-"""An artifact is what does not change from view to view: one view cannot show it."""
 
 
 def check_device(device: torch.device | str) -> None:
@@ -57,63 +52,6 @@ def check_settings(model: ModelSettings, device: torch.device | str) -> None:
     needed = {"gsplat": "cuda", "cpu": "cpu"}.get(model.rasterizer)
     if needed is not None and torch.device(device).type != needed:
         raise InputError(f"--pipeline.model.rasterizer {model.rasterizer} does not run on {device}", "use auto")
-
-
-def check_transforms(data: Path) -> None:
-    """Refuse a nerfstudio dataset whose transforms.json is missing, unreadable, empty, or holds broken poses.
-
-    Has to run before the dataparser does: it averages the poses, after which one bad frame has spoilt all of them.
-
-    Args:
-        data: the dataset's folder, or its .json file.
-    """
-    path = data if data.suffix == ".json" else data / "transforms.json"
-    if not data.exists():
-        raise InputError(f"{data} does not exist", "give --data a folder that holds transforms.json and the photos")
-    if not path.exists():
-        raise InputError(f"{path} does not exist", "give --data a folder that ns-process-data or ssa process made")
-    try:
-        frames = json.loads(path.read_text())["frames"]
-        if not isinstance(frames, list):
-            raise TypeError
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} is no valid JSON ({error})", "write it again with ns-process-data") from error
-    except (KeyError, TypeError) as error:
-        raise InputError(f"{path} has no list 'frames'", "write it again with ns-process-data") from error
-    if len(frames) < MIN_VIEWS:
-        raise InputError(
-            f"{path} lists {len(frames)} photos", f"at least {MIN_VIEWS} are needed, 30 and more work well"
-        )
-    for frame in frames:
-        if not isinstance(frame, dict):
-            raise InputError(f"{path}: the frame {frame!r} is no object with file_path and transform_matrix")
-        name = frame.get("file_path", "a frame without file_path")
-        matrix = np.array(frame.get("transform_matrix", []), dtype=object)
-        try:
-            finite = matrix.shape in ((4, 4), (3, 4)) and all(math.isfinite(float(v)) for v in matrix.flat)
-        except (TypeError, ValueError):
-            finite = False
-        if not finite:
-            raise InputError(
-                f"{path}: the pose of {name} is no 4 x 4 matrix of finite numbers",
-                "remove that frame or register it again",
-            )
-        if not _found(path.parent / str(name)):
-            raise InputError(f"{path} names {name}, which does not exist", "put the photo there or remove the frame")
-    positions = np.array([np.array(frame["transform_matrix"], dtype=float)[:3, 3] for frame in frames])
-    if (positions == positions[0]).all():
-        raise InputError(
-            f"{path}: all cameras are in one place, from which no depth can be seen",
-            "move the camera between photos, or register them again",
-        )
-
-
-def _found(photo: Path) -> bool:
-    """Whether there is a photo, in its folder or in a reduced copy beside it (images_4)."""
-    try:
-        return photo.exists() or bool(list(photo.parent.parent.glob(f"{photo.parent.name}_*/{photo.name}")))
-    except OSError:  # no path: too long
-        return False
 
 
 def check_views(outputs: DataparserOutputs, source: Path) -> None:

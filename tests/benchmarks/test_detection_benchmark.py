@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.detection import Command, detections, rates, spread, stretches
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -54,7 +53,7 @@ def in_frames(key: str, values: list) -> Callable[[dict], None]:
 
 
 def test_camera_models_are_nerfstudios():
-    kinds = {name: kind for name, kind in CAMERA_MODEL_TO_TYPE.items()}
+    kinds = CAMERA_MODEL_TO_TYPE
     assert {name for name, kind in kinds.items() if kind == CameraType.PERSPECTIVE} == PERSPECTIVE_MODELS
     assert {name for name, kind in kinds.items() if kind == CameraType.FISHEYE} == FISHEYE_MODELS
     assert kinds.keys() == PERSPECTIVE_MODELS | FISHEYE_MODELS | OTHER_MODELS
@@ -73,7 +72,7 @@ def test_camera_models_are_nerfstudios():
         in_frames("distortion_params", [[0.01 * number, 0, 0, 0, 0, 0] for number in range(5)]),
         in_frames("mask_path", [name.replace("images", "masks") for name in NAMES]),
         in_frames("depth_file_path", [name.replace("images", "nowhere") for name in NAMES]),
-        lambda meta: meta["frames"].append(copy.deepcopy(meta["frames"][0])),
+        lambda meta: meta["frames"].append(dict(meta["frames"][0])),
         lambda meta: meta.update(train_filenames=NAMES, val_filenames=NAMES[:1]),
         lambda meta: meta.update(train_filenames=[f"./{name}" for name in NAMES], val_filenames=[]),
         lambda meta: meta.update(
@@ -109,11 +108,11 @@ def pose(row: list | None) -> Callable[[dict], object]:
     [
         (lambda meta: meta.pop("frames"), "has no list 'frames' of objects with a file_path"),
         (lambda meta: meta.update(frames={}), "has no list 'frames'"),
-        (lambda meta: meta["frames"][2].pop("file_path"), r"the frame \{'transform_matrix.* is none; correct or remove"),
+        (lambda meta: meta["frames"][2].pop("file_path"), r"the frame \{'transform_matrix.* is none"),
         (lambda meta: meta.update(camera_model="FISHEYE"), "camera_model 'FISHEYE' is none of EQUIRECTANGULAR"),
         (lambda meta: meta.update(camera_model=["OPENCV"]), "camera_model .* is none of"),
         (lambda meta: meta.pop("fl_x"), "camera of images/0.png: fl_x is missing"),
-        (in_frames("fl_y", [14, 14, 0, 14, 14]), "camera of images/2.png: focal lengths must be positive, got 14 and 0"),
+        (in_frames("fl_y", [14, 14, 0, 14, 14]), "images/2.png: focal lengths must be positive, got 14 and 0"),
         (lambda meta: meta.update(fl_x=-14), "focal lengths must be positive"),
         (lambda meta: meta.update(k1=float("nan")), "intrinsics must be finite, distortion is nan"),
         (lambda meta: meta.update(cx=1e300), r"intrinsics must be finite, cx is 1e\+300"),
@@ -128,7 +127,7 @@ def pose(row: list | None) -> Callable[[dict], object]:
         (pose([1, 0, 0, float("nan")]), "the pose of images/3.png"),
         (pose([1, 0, 0, 1e39]), "the pose of images/3.png"),
         (pose([1, 0, 0]), "the pose of images/3.png"),
-        (lambda meta: [f.update(transform_matrix=np.eye(4).tolist()) for f in meta["frames"]], "all cameras are in one"),
+        (lambda meta: [f.update(transform_matrix=np.eye(4).tolist()) for f in meta["frames"]], "in one place"),
         (lambda meta: [f.update(transform_matrix=f["transform_matrix"][:3]) for f in meta["frames"]], "the pose of"),
         (lambda meta: meta.update(applied_transform=np.eye(4).tolist()), "applied_transform is no 3 x 4 matrix"),
         (lambda meta: meta.update(applied_scale="large"), "applied_scale is no finite number"),

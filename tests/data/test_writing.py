@@ -28,14 +28,14 @@ def test_a_folder_appears_at_the_end(tmp_path):
 
 
 def test_nothing_of_a_folder_is_left_after_an_error(tmp_path):
-    with pytest.raises(Interrupted), staged_folder(tmp_path / "out") as folder:
+    with pytest.raises(Interrupted), staged_folder(tmp_path / "out") as folder:  # noqa: PT012 - the block is the test
         (folder / "file").write_text("content")
         raise Interrupted
     assert names(tmp_path) == []
 
 
 def test_a_folder_that_exists_or_cannot_be_written_is_refused(tmp_path):
-    with pytest.raises(InputError, match="exists already; remove it"), staged_folder(tmp_path):
+    with pytest.raises(InputError, match=r"exists already; remove it"), staged_folder(tmp_path):
         pass
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"file/out cannot be written \("), staged_folder(tmp_path / "file" / "out"):
@@ -45,7 +45,7 @@ def test_a_folder_that_exists_or_cannot_be_written_is_refused(tmp_path):
 def test_a_file_is_replaced_at_the_end_or_stays_as_it_was(tmp_path):
     path = tmp_path / "file"
     path.write_text("old")
-    with pytest.raises(Interrupted), staged_file(path) as part:
+    with pytest.raises(Interrupted), staged_file(path) as part:  # noqa: PT012
         part.write_text("half")
         raise Interrupted
     assert path.read_text() == "old"
@@ -72,7 +72,7 @@ def test_several_files_appear_at_the_end_and_none_after_an_error(tmp_path):
         (staged / "two").write_text("2")
         assert not folder.exists()
     assert names(tmp_path) == ["folder", "folder/one", "folder/two"]
-    with pytest.raises(Interrupted), staged_files(folder, scratch) as staged:
+    with pytest.raises(Interrupted), staged_files(folder, scratch) as staged:  # noqa: PT012
         (staged / "three").write_text("3")
         raise Interrupted
     assert names(tmp_path) == ["folder", "folder/one", "folder/two"]
@@ -80,11 +80,11 @@ def test_several_files_appear_at_the_end_and_none_after_an_error(tmp_path):
 
 def test_errors_of_the_system_name_the_output(tmp_path):
     with (
-        pytest.raises(InputError, match="out cannot be written .*; free space there"),
+        pytest.raises(InputError, match=r"out cannot be written .*; free space there"),
         unwritable_as_input_error(tmp_path / "out"),
     ):
         raise OSError(28, "No space left on device")
-    with pytest.raises(InputError, match="nowhere/a.json cannot be written"):
+    with pytest.raises(InputError, match=r"nowhere/a.json cannot be written"):
         write_text(tmp_path / "nowhere" / "a.json", "{}")
 
 

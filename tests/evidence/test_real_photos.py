@@ -10,7 +10,7 @@ import torch
 from benchmarks.detection import detections, stretches
 from benchmarks.real_artifact import undistorted_mask
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
 
 pytestmark = pytest.mark.slow
 

@@ -11,9 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from mutations import OFTEN, mutated, one_line
 
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.data.training_requirements import check_training
+from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.plugin.validation import check_transforms
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +30,7 @@ def test_transforms_are_read_or_refused(data, dataset, tmp_path_factory):
     shutil.copytree(dataset, folder)
     original = json.loads((dataset / "transforms.json").read_text())
     (folder / "transforms.json").write_text(json.dumps(mutated(original, data.draw)))
-    for check in (lambda: check_transforms(folder), lambda: Dataset.read(folder, 8)):
+    for check in (lambda: check_training(Transforms.read(folder)), lambda: Dataset.read(folder, 8)):
         try:
             check()
         except InputError as refused:
@@ -43,7 +44,7 @@ def test_transforms_are_read_or_refused(data, dataset, tmp_path_factory):
 def test_anything_at_all_is_refused(content, tmp_path_factory):
     path = tmp_path_factory.mktemp("x") / "transforms.json"
     path.write_bytes(content)
-    for read in (lambda: check_transforms(path.parent), lambda: Dataset.read(path.parent, 8)):
+    for read in (lambda: check_training(Transforms.read(path.parent)), lambda: Dataset.read(path.parent, 8)):
         with pytest.raises(InputError) as caught:
             read()
         one_line(caught.value)

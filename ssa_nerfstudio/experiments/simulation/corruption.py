@@ -10,8 +10,8 @@ import numpy as np
 from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
 from ssa_nerfstudio.cameras.lens import Lens, undistort, undistorted
-from ssa_nerfstudio.data.photos import read_photo, write_photo
-from ssa_nerfstudio.data.transforms import Dataset, View
+from ssa_nerfstudio.data.dataset import Dataset, View
+from ssa_nerfstudio.data.photos import write_photo
 from ssa_nerfstudio.experiments.effects.composition import Composition
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation.layer_files import LayerFile, write_view
@@ -42,7 +42,7 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
 
         def work(item: tuple[int, View], artifact: Composition = artifact) -> Layers | None:
             number, view = item
-            photo = read_photo(dataset.source(view.path), view.lens.width, view.lens.height)
+            photo = dataset.read_photo(view)
             inside = None
             if artifact.box is not None:
                 inside = artifact.view(scene.view_generators(artifact, number))

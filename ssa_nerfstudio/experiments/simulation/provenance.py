@@ -13,7 +13,7 @@ import PIL
 import yaml
 
 from ssa_nerfstudio import __version__
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.experiments.simulation.scene import Scene
 
 

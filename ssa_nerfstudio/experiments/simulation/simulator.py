@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from rich.console import Console
 from rich.progress import Progress
 
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.writing import staged_folder
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.simulation.corruption import corrupt

@@ -40,7 +40,7 @@ def truncate(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda data: (data / "transforms.json").unlink(), "transforms.json does not exist; give --data"),
+        (lambda data: (data / "transforms.json").unlink(), "transforms.json does not exist; choose a folder"),
         (lambda data: (data / "transforms.json").write_text("{"), "is no valid JSON"),
         (lambda data: (data / "transforms.json").write_text("[]"), "has no list 'frames'"),
         (lambda data: edit(data, frames=[{"transform_matrix": []}]), "has no list 'frames'"),
@@ -57,7 +57,7 @@ def truncate(path: Path) -> None:
         (lambda data: edit(data, k1=0.1, w=1), "leaves no pixel of 1 x 36"),
         (lambda data: edit(data, k1=-30.0, camera_model="OPENCV_FISHEYE"), "folds its frame"),
         (lambda data: edit(data, k1=0.1, camera_model="FISHEYE624"), "FISHEYE624 with distortion"),
-        (lambda data: edit(data, w=50), "frame_001.jpg is 48 x 36, transforms.json says 50 x 36"),
+        (lambda data: edit(data, w=50), "frame_001.jpg is 48 x 36, expected 50 x 36"),
         (lambda data: (data / "images/frame_003.jpg").unlink(), "frame_003.jpg does not exist; put the photo there"),
         (lambda data: (data / "images/frame_003.jpg").write_text("no"), "frame_003.jpg cannot be read as a photo"),
         (lambda data: truncate(data / "images/frame_003.jpg"), "frame_003.jpg cannot be read as a photo"),

@@ -8,7 +8,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from small_datasets import pixels, write_dataset
 
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.data.transforms import Dataset
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.plugin.camera_matching import group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.overlay_setup import given_overlays

@@ -18,8 +18,8 @@ from small_datasets import contents, edit, pixels, write_dataset
 from benchmarks.simulator import measure
 from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.photos import write_photo
-from ssa_nerfstudio.data.transforms import Dataset
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation import corruption

@@ -11,8 +11,8 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from PIL import Image
 
-from ssa_nerfstudio.data.transforms import Dataset
-from ssa_nerfstudio.data.writing import staged_folder
+from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.data.writing import staged_file, staged_folder
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import DEMO
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN
@@ -83,10 +83,8 @@ class KeptScene(Scene):
         if drawn.box is None:
             layers = drawn.whole(None, height, width)
             self.folder.mkdir(parents=True, exist_ok=True)
-            scratch = path.with_suffix(".part")
-            with scratch.open("wb") as file:
+            with staged_file(path) as part, part.open("wb") as file:
                 np.savez_compressed(file, T=layers.transmittance, B=layers.addition)
-            scratch.rename(path)
         return drawn
 
 
@@ -118,10 +116,10 @@ def _reduce(dataset: Dataset, factor: int, output: Path) -> None:
             (folder / name).write_bytes((dataset.root / name).read_bytes())
         (folder / f"images_{factor}").mkdir()
         for view in dataset.views:
-            with Image.open(dataset.source(view.path)) as photo:
-                size = photo.width // factor, photo.height // factor
-                box = (0, 0, size[0] * factor, size[1] * factor)
-                small = photo.convert("RGB").resize(size, Image.Resampling.BOX, box=box)
+            photo = Image.fromarray(dataset.read_photo(view))
+            size = photo.width // factor, photo.height // factor
+            box = (0, 0, size[0] * factor, size[1] * factor)
+            small = photo.resize(size, Image.Resampling.BOX, box=box)
             name = PurePosixPath(view.path).name
             # PNG's bytes under whatever name transforms.json gives: readers go by content.
             small.save(folder / f"images_{factor}" / name, format="PNG")

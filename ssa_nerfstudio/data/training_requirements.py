@@ -1,0 +1,131 @@
+"""What training needs of a transforms.json beyond what every reader does: enough views, poses, and files that exist."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from ssa_nerfstudio.data.transforms import FILE_KEYS, SPLITS, Split, Transforms, is_file
+from ssa_nerfstudio.errors import InputError
+
+MIN_VIEWS = 2
+"""A static artifact is what does not change between views, so one view cannot show it."""
+_ORIENTATION_METHODS = ("none", "pca", "up", "vertical")
+
+
+def check_training(
+    transforms: Transforms, downscale_factor: int | None = None, splits: Iterable[Split] = ("train", "val")
+) -> None:
+    """Check that nerfstudio can train on a dataset.
+
+    Has to run before nerfstudio's dataparser, which averages the poses: one bad pose spoils all of them.
+
+    Args:
+        transforms: of the dataset.
+        downscale_factor: N > 1 reads images_N. None: nerfstudio chooses from the size of the first photo.
+        splits: what nerfstudio will ask for. Where the file states any split, it has to state these.
+
+    Raises:
+        InputError: something is missing or wrong.
+    """
+    path, count = transforms.path, len(transforms.frames)
+    if count < MIN_VIEWS:
+        raise InputError(f"{path} lists {count} photos; at least {MIN_VIEWS} are needed, 30 and more work well")
+    if downscale_factor is not None and downscale_factor < 1:
+        raise InputError(f"the downscale factor must be at least 1, got {downscale_factor}", "2 reads images_2")
+    _check_poses(transforms)
+    _check_alignment(transforms)
+    _check_lenses(transforms)
+    _check_files(transforms, downscale_factor)
+    if any(transforms.stated_split(split) is not None for split in SPLITS):
+        for split in splits:
+            if transforms.stated_split(split) is None:
+                raise InputError(
+                    f"{path} states a split without {split}_filenames", "add that list, or remove the others"
+                )
+
+
+def _check_poses(transforms: Transforms) -> None:
+    positions = []
+    for frame in transforms.frames:
+        pose = _finite(frame.get("transform_matrix"))
+        if pose is None or pose.shape != (4, 4):
+            raise InputError(
+                f"{transforms.path}: the pose of {frame['file_path']} is no 4 x 4 matrix of finite numbers",
+                "correct it, or remove that frame",
+            )
+        positions.append(pose[:3, 3])
+    if (np.array(positions) == positions[0]).all():
+        raise InputError(
+            f"{transforms.path}: all cameras are in one place, from which no depth can be seen",
+            "move the camera between photos, or register them again",
+        )
+
+
+def _check_alignment(transforms: Transforms) -> None:
+    """Check the entries that move poses and points into nerfstudio's world."""
+    path, meta = transforms.path, transforms.meta
+    if "applied_transform" in meta:
+        applied = _finite(meta["applied_transform"])
+        if applied is None or applied.shape != (3, 4):
+            raise InputError(f"{path}: applied_transform is no 3 x 4 matrix of finite numbers", "correct or remove it")
+    scale = _finite(meta.get("applied_scale", 1.0))
+    if scale is None or scale.shape != ():
+        raise InputError(f"{path}: applied_scale is no finite number", "correct or remove it")
+    if meta.get("orientation_override", "none") not in _ORIENTATION_METHODS:
+        names = ", ".join(_ORIENTATION_METHODS)
+        raise InputError(f"{path}: orientation_override is none of {names}", "correct or remove it")
+    if not isinstance(meta.get("ply_file_path", ""), str):
+        raise InputError(f"{path}: ply_file_path is no file path", "correct or remove it")
+
+
+def _check_lenses(transforms: Transforms) -> None:
+    if transforms.camera_model == "FISHEYE624":
+        return  # nerfstudio undistorts it by itself
+    for frame in transforms.frames:
+        try:
+            transforms.lens(frame)
+        except ValueError as error:
+            raise InputError(
+                f"{transforms.path}: camera of {frame['file_path']}: {error}", "process the photos again"
+            ) from error
+
+
+def _check_files(transforms: Transforms, downscale_factor: int | None) -> None:
+    for key, kind in FILE_KEYS.items():
+        names = [frame[key] for frame in transforms.frames if key in frame]
+        if not all(isinstance(name, str) for name in names):
+            raise InputError(f"{transforms.path}: a {key} is no file path", "correct or remove it")
+        if 0 < len(names) < len(transforms.frames):
+            raise InputError(
+                f"{transforms.path}: {len(names)} of {len(transforms.frames)} frames have a {key}",
+                "state it in all frames or in none",
+            )
+        if kind == "depths":
+            continue  # splatfacto does not open them
+        if downscale_factor is not None:
+            transforms.check_exist(names, kind, downscale_factor)
+            continue
+        if kind == "images":
+            transforms.check_exist(names[:1])  # nerfstudio chooses by its size
+        transforms.check_exist([name for name in names if not _in_a_smaller_size(transforms.root / name)], kind)
+
+
+def _in_a_smaller_size(photo: Path) -> bool:
+    """Whether a reduced copy lies beside the photo's folder, as in images_4."""
+    try:
+        return any(is_file(folder / photo.name) for folder in photo.parent.parent.glob(f"{photo.parent.name}_*"))
+    except (OSError, ValueError, NotImplementedError):  # the name of a folder that can be none
+        return False
+
+
+def _finite(value: object) -> np.ndarray | None:
+    """Numbers as float32, which nerfstudio reads them as; None where one is no number or not finite."""
+    with np.errstate(over="ignore"):
+        try:
+            array = np.array(value, dtype=object).astype(np.float32)
+        except (TypeError, ValueError, OverflowError):
+            return None
+    return array if np.isfinite(array).all() else None
