@@ -18,12 +18,24 @@ from rich.table import Table
 from torch import Tensor
 
 from ssa_nerfstudio.rasterization import rasterizer, reference
+from ssa_nerfstudio.rasterization.interface import Gaussians, RenderOptions
 from ssa_nerfstudio.rasterization.projection import project
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
 """What a Gaussian consists of, in the order of the rasterizers' arguments."""
 Scene = tuple[dict[str, Tensor], Tensor, Tensor]
 """Parameters as `rasterization` takes them, viewmats [C, 4, 4], Ks [C, 3, 3]."""
+OPTIONS = RenderOptions(
+    near_plane=0.01,
+    far_plane=1e10,
+    radius_clip=0.0,
+    eps2d=0.3,
+    sh_degree=3,
+    render_mode="RGB",
+    absgrad=False,
+    antialiased=False,
+)
+"""The defaults of `rasterization`, with third-degree harmonics."""
 
 
 def random_scene(
@@ -84,6 +96,13 @@ def draw(
     return {name: value.detach().to("cpu", torch.float64) for name, value in results.items()}
 
 
+def floor(gaussians: dict[str, Tensor], viewmats: Tensor, Ks: Tensor, width: int, height: int) -> None:
+    """Projection, harmonics and autograd in torch, without blending: a lower bound of a torch rasterizer's time."""
+    leaves = Gaussians(**{name: value.detach().clone().requires_grad_() for name, value in gaussians.items()})
+    splats = project(leaves, viewmats[0], Ks[0], width, height, OPTIONS)
+    (splats.means2d.sum() + splats.conics.sum() + splats.opacities.sum() + splats.colors.sum()).backward()
+
+
 def relative_error(a: Tensor, b: Tensor) -> float:
     """|a - b| / |b| in the 2-norm."""
     return float((a - b).norm() / b.norm().clamp_min(1e-300))
@@ -124,15 +143,7 @@ def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10)
     """Median milliseconds of forward + backward, and their ratio to projection + SH + autograd alone ("floor")."""
     scene = random_scene(n, width, height, size)
 
-    def floor(gaussians: dict[str, Tensor], viewmats: Tensor, Ks: Tensor) -> None:
-        leaves = {name: value.detach().clone().requires_grad_() for name, value in gaussians.items()}
-        splats = project(
-            **leaves, viewmat=viewmats[0], K=Ks[0], width=width, height=height,
-            near_plane=0.01, far_plane=1e10, radius_clip=0.0, eps2d=0.3, sh_degree=3, antialiased=False,
-        )  # fmt: skip
-        (splats.means2d.sum() + splats.conics.sum() + splats.opacities.sum() + splats.colors.sum()).backward()
-
-    runs: dict[str, Callable] = {"floor": lambda: floor(*scene)}
+    runs: dict[str, Callable] = {"floor": partial(floor, *scene, width, height)}
     for name, (rasterization, device, dtype) in bodies().items():
         if dtype == torch.float32:
             runs[name] = partial(draw, rasterization, *_moved(scene, device, dtype), width, height)

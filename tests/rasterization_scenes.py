@@ -1,4 +1,4 @@
-"""Scenes and comparisons that the tests of this room share."""
+"""Scenes and comparisons for tests of the rasterizers."""
 
 from __future__ import annotations
 

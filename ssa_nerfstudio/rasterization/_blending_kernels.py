@@ -1,6 +1,6 @@
 """Numba kernels of the `cpu` rasterizer: splats are blended band by band, a band being one row of 16 x 16 tiles.
 
-A band belongs to one thread and its splats come in order of depth, so the picture does not depend on the number of
+A band belongs to one thread and its splats come in order of depth, so the image does not depend on the number of
 threads; gradients are written once per (splat, band) and summed in a fixed order afterwards, so they do not either.
 
 Along a row of pixels the exponent of a Gaussian is a parabola, so alpha obeys a recurrence of two multiplications:

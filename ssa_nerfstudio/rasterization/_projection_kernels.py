@@ -40,7 +40,7 @@ def _rotation(quat, out):
 
 @njit(cache=True, nogil=True, inline="always")
 def _limits(K, width, height):
-    """Bounds of x / z and y / z within which the projection is linearised: the frame and 15 % beyond each side."""
+    """Bounds of x / z and y / z within which the projection is linearized: the frame and 15 % beyond each side."""
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.3 * 0.5 * width / fx, 0.3 * 0.5 * height / fy
     return -(cx / fx + margin_x), (width - cx) / fx + margin_x, -(cy / fy + margin_y), (height - cy) / fy + margin_y
@@ -95,7 +95,7 @@ def project_gaussians(
 def backpropagate_projection(
     thread, threads, ids, means, quats, scales, viewmat, K, width, height, eps2d, v_splats, v_means, v_quats, v_scales
 ):
-    """Add to v_means [N, 3], v_quats [N, 4], v_scales [N, 3] what v_splats [V, 6] (as geometry) pulls back."""
+    """Add to v_means [N, 3], v_quats [N, 4], v_scales [N, 3] what v_splats [V, 6] (as geometry) contributes."""
     n = ids.shape[0]
     fx, fy = K[0, 0], K[1, 1]
     x_min, x_max, y_min, y_max = _limits(K, width, height)
@@ -216,7 +216,7 @@ def shade(thread, threads, ids, means, center, coefficients, degree, colors):
 def backpropagate_shading(
     thread, threads, ids, means, center, coefficients, degree, colors, v_colors, v_means, v_coefficients
 ):
-    """Add to v_means [N, 3] and v_coefficients [N, K, 3] what v_colors [V, 0:3] pulls back; none where clamped."""
+    """Add to v_means [N, 3] and v_coefficients [N, K, 3] what v_colors [V, 0:3] contributes; none where clamped."""
     n = ids.shape[0]
     bases = (degree + 1) ** 2
     Y, dot = np.empty(16), np.zeros(16)

@@ -1,4 +1,4 @@
-"""The constants of gsplat 1.4.0's rasterizer that any other body has to share to draw the same picture.
+"""The constants of gsplat 1.4.0's rasterizer, which all bodies share to draw the same image.
 
 Source: `gsplat/cuda/csrc/rasterize_to_pixels_fwd.cu` and `gsplat/rendering.py` at version 1.4.0. Pixel centers lie at
 +0.5.
@@ -7,13 +7,13 @@ Source: `gsplat/cuda/csrc/rasterize_to_pixels_fwd.cu` and `gsplat/rendering.py` 
 EPS2D = 0.3
 """Added to the diagonal of the projected covariance, in square pixels."""
 NEAR_PLANE = 0.01
-"""Gaussians whose center is nearer than this, in world units along the view axis, are not drawn."""
+"""Gaussians with centers nearer than this along the view axis, in world units, are not drawn."""
 FAR_PLANE = 1e10
-"""Gaussians whose center is farther than this are not drawn."""
+"""Gaussians with centers farther than this are not drawn."""
 TILE = 16
-"""Side of a tile in pixels: a Gaussian is drawn in every tile that its three-sigma square touches, and nowhere else."""
+"""Side of a tile in pixels: a Gaussian is drawn in the tiles that its three-sigma square touches."""
 ALPHA_MAX = 0.999
-"""Largest alpha of one Gaussian at one pixel; its gradient is zero beyond."""
+"""Largest alpha of one Gaussian at one pixel; its gradient is zero above."""
 ALPHA_MIN = 1.0 / 255.0
 """A Gaussian with less alpha than this at a pixel is skipped there."""
 TRANSMITTANCE_MIN = 1e-4

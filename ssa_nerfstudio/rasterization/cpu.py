@@ -1,4 +1,4 @@
-"""The rasterizer without CUDA: numba, forward and hand-written backward, deterministic for any number of threads."""
+"""The rasterizer for CPUs: numba kernels with a hand-written backward pass, deterministic for any number of threads."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ from ssa_nerfstudio._system.kernel_threads import on_all_threads
 from ssa_nerfstudio.rasterization import _blending_kernels as _kernels
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.cpu_projection import project
-from ssa_nerfstudio.rasterization.interface import rasterization_with
+from ssa_nerfstudio.rasterization.interface import make_rasterization
 from ssa_nerfstudio.rasterization.projection import Splats
+from ssa_nerfstudio.rasterization.splatting import project_and_blend
 
 
 def blend(
     splats: Splats, means2d: Tensor, camera: int, width: int, height: int, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
-    """Blend one camera's splats, front to back. See `interface.Blend`; float32 or float64."""
+    """Blend one camera's splats, front to back. See `splatting.Blend`; float32 or float64."""
     return _Blend.apply(
         means2d,
         splats.conics,
@@ -32,13 +33,13 @@ def blend(
     )  # pyright: ignore[reportReturnType]
 
 
-rasterization = rasterization_with(blend, project)
+rasterization = make_rasterization(project_and_blend(project, blend))
 
 
 def compile_kernels() -> None:
-    """Compile (or load from numba's cache) the float32 kernels, so that the first frame does not wait for it.
+    """Compile (or load from numba's cache) the float32 kernels, so that the first frame need not wait.
 
-    Has to run before nerfstudio's viewer does: it renders in a thread under `sys.settrace` that raises at arbitrary
+    Has to run before nerfstudio's viewer starts: it renders in a thread under `sys.settrace` that raises at arbitrary
     lines, in the middle of a compilation too.
     """
     one = torch.ones(1, 3, requires_grad=True)
@@ -52,7 +53,7 @@ def compile_kernels() -> None:
 
 
 class _Blend(torch.autograd.Function):
-    """Autograd's door to the kernels; gradients of the centers arrive at the whole `means2d` [C, N, 2]."""
+    """The blending kernels as an autograd function; centers receive gradients as the whole `means2d` [C, N, 2]."""
 
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, ids, radii, camera, width, height, absgrad):  # pyright: ignore
@@ -95,7 +96,7 @@ class _Blend(torch.autograd.Function):
         v_means2d = torch.zeros_like(means2d)
         v_means2d[ctx.camera, ids] = v[:, 0:2]
         if ctx.absgrad:
-            # gsplat's contract with its DefaultStrategy; several cameras add up, each in rows of its own.
+            # As gsplat's DefaultStrategy expects it; each camera fills its own rows.
             if not hasattr(means2d, "absgrad"):
                 means2d.absgrad = torch.zeros_like(means2d)
             means2d.absgrad[ctx.camera, ids] = v[:, 2:4]

@@ -1,4 +1,4 @@
-"""`projection.project` by numba kernels: what the `cpu` rasterizer projects with."""
+"""`projection.project` by numba kernels, for the `cpu` rasterizer."""
 
 from __future__ import annotations
 
@@ -9,50 +9,37 @@ from torch import Tensor
 from ssa_nerfstudio._system.kernel_threads import on_all_threads
 from ssa_nerfstudio.rasterization import _projection_kernels as kernels
 from ssa_nerfstudio.rasterization import projection
+from ssa_nerfstudio.rasterization.interface import Gaussians, RenderOptions
 from ssa_nerfstudio.rasterization.projection import Splats
 
-HIGHEST_DEGREE = 3
-"""Degree of spherical harmonics up to which there is a kernel."""
+MAX_SH_DEGREE = 3
+"""The kernels evaluate spherical harmonics up to this degree."""
 
 
 def project(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    sh_degree: int | None,
-    antialiased: bool,
+    gaussians: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, options: RenderOptions
 ) -> Splats:
-    """Same arguments and result as `projection.project`.
+    """Project by the kernels; arguments and result of `projection.project`.
 
-    Rare requests go to that one: gradients of the camera (a camera optimizer), antialiasing, harmonics above degree 3.
+    Gradients of the camera (a camera optimizer), antialiasing and harmonics above degree 3 have no kernels and go to
+    `projection.project`.
     """
-    if viewmat.requires_grad or K.requires_grad or antialiased or (sh_degree or 0) > HIGHEST_DEGREE:
-        return projection.project(
-            means, quats, scales, opacities, colors, viewmat, K, width, height,
-            near_plane=near_plane, far_plane=far_plane, radius_clip=radius_clip, eps2d=eps2d, sh_degree=sh_degree,
-            antialiased=antialiased,
-        )  # fmt: skip
+    sh_degree = options.sh_degree
+    if viewmat.requires_grad or K.requires_grad or options.antialiased or (sh_degree or 0) > MAX_SH_DEGREE:
+        return projection.project(gaussians, viewmat, K, width, height, options)
+    means, quats, scales, opacities, colors = gaussians
     n = means.shape[0]
     camera = (viewmat.detach().to(torch.float64).numpy(), K.detach().to(torch.float64).numpy(), width, height)
     arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (means, quats, scales)]
     geometry = np.empty((n, 6), arrays[0].dtype)
     radii = np.empty(n, np.int32)
-    planes = (near_plane, far_plane, radius_clip, eps2d)
-    on_all_threads(kernels.project_gaussians, *arrays, *camera, *planes, geometry, radii)
+    limits = (options.near_plane, options.far_plane, options.radius_clip, options.eps2d)
+    on_all_threads(kernels.project_gaussians, *arrays, *camera, *limits, geometry, radii)
     drawn = np.flatnonzero(radii)
     ids = torch.from_numpy(drawn[np.argsort(geometry[drawn, 5], kind="stable")])
-    splats, shaded = _Project.apply(means, quats, scales, colors, ids, geometry, arrays, camera, eps2d, sh_degree)  # pyright: ignore
+    splats, shaded = _Project.apply(  # pyright: ignore[reportGeneralTypeIssues]
+        means, quats, scales, colors, ids, geometry, arrays, camera, options.eps2d, sh_degree
+    )
     return Splats(
         ids=ids,
         radii=torch.from_numpy(radii)[ids],
@@ -64,7 +51,7 @@ def project(
 
 
 class _Project(torch.autograd.Function):
-    """Autograd's door to the projection kernels: geometry [V, 6] and color [V, 3] of the drawn Gaussians."""
+    """The projection kernels as an autograd function: geometry [V, 6] and color [V, 3] of the drawn Gaussians."""
 
     @staticmethod
     def forward(ctx, means, quats, scales, colors, ids, geometry, arrays, camera, eps2d, sh_degree):  # pyright: ignore
@@ -83,9 +70,9 @@ class _Project(torch.autograd.Function):
         numbers = ids.numpy()
         v_means, v_quats, v_scales = (np.zeros_like(array) for array in arrays)
         v_colors = np.zeros_like(coefficients)
-        pulled = v_splats.contiguous().numpy()
+        v_geometry = v_splats.contiguous().numpy()
         on_all_threads(
-            kernels.backpropagate_projection, numbers, *arrays, *camera, eps2d, pulled, v_means, v_quats, v_scales
+            kernels.backpropagate_projection, numbers, *arrays, *camera, eps2d, v_geometry, v_means, v_quats, v_scales
         )
         v = v_shaded.contiguous().numpy()
         if sh_degree is None:

@@ -1,13 +1,12 @@
-"""gsplat's CUDA kernels behind the signature of `interface.rasterization_with`.
+"""gsplat's CUDA kernels behind `interface.make_rasterization`.
 
-The same sequence of gsplat's public operators as `gsplat.rasterization`, less one thing: that function inverts the view
-matrix with `torch.inverse`, which waits for the device at every frame. A rigid matrix needs no solver.
+The same sequence of gsplat's public operators as `gsplat.rasterization`, with one difference: that function inverts the
+view matrix with `torch.inverse`, which waits for the device at every frame. A rigid matrix needs no solver.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
 
 import torch
 from gsplat import (
@@ -19,35 +18,14 @@ from gsplat import (
 )
 from torch import Tensor
 
-from ssa_nerfstudio.rasterization import constants
+from ssa_nerfstudio.rasterization.constants import TILE
+from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, make_rasterization
 
 
-def rasterization(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4]
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, 3] or [N, K, 3]
-    viewmats: Tensor,  # [C, 4, 4]
-    Ks: Tensor,  # [C, 3, 3]
-    width: int,
-    height: int,
-    near_plane: float = constants.NEAR_PLANE,
-    far_plane: float = constants.FAR_PLANE,
-    radius_clip: float = 0.0,
-    eps2d: float = constants.EPS2D,
-    sh_degree: int | None = None,
-    packed: bool = False,
-    tile_size: int = constants.TILE,
-    backgrounds: Tensor | None = None,  # [C, 3]
-    render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
-    sparse_grad: bool = False,
-    absgrad: bool = False,
-    rasterize_mode: Literal["classic", "antialiased"] = "classic",
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Draw N Gaussians into C pinhole cameras with rigid view matrices. See `interface.rasterization_with`."""
-    if packed or sparse_grad:
-        raise ValueError("packed and sparse_grad are not supported; leave them out")
+def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Render with gsplat's kernels. See `interface.Render`."""
+    means, quats, scales, opacities, colors = gaussians
+    viewmats, Ks, width, height, backgrounds = cameras
     n_cameras = viewmats.shape[0]
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         means,
@@ -58,56 +36,49 @@ def rasterization(
         Ks,
         width,
         height,
-        eps2d=eps2d,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        radius_clip=radius_clip,
-        calc_compensations=rasterize_mode == "antialiased",
+        eps2d=options.eps2d,
+        near_plane=options.near_plane,
+        far_plane=options.far_plane,
+        radius_clip=options.radius_clip,
+        calc_compensations=options.antialiased,
     )
     alphas = opacities.expand(n_cameras, -1)
     if compensations is not None:
         alphas = alphas * compensations
-    if sh_degree is None:
+    if options.sh_degree is None:
         rgb = colors.expand(n_cameras, -1, -1)
     else:
         centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])  # [C, 3, 1]
         directions = means - centers.transpose(1, 2)
-        rgb = spherical_harmonics(sh_degree, directions, colors.expand(n_cameras, -1, -1, -1), masks=radii > 0)
+        coefficients = colors.expand(n_cameras, -1, -1, -1)
+        rgb = spherical_harmonics(options.sh_degree, directions, coefficients, masks=radii > 0)
         rgb = torch.clamp_min(rgb + 0.5, 0.0)
     channels = rgb
-    if render_mode != "RGB":
-        channels = depths[..., None] if render_mode in ("D", "ED") else torch.cat([rgb, depths[..., None]], dim=-1)
+    if options.render_mode != "RGB":
+        depth_only = options.render_mode in ("D", "ED")
+        channels = depths[..., None] if depth_only else torch.cat([rgb, depths[..., None]], dim=-1)
         if backgrounds is not None:
             backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
             backgrounds = backgrounds[:, -channels.shape[-1] :]
-    tiles = math.ceil(width / tile_size), math.ceil(height / tile_size)
-    _, isect_ids, flatten_ids = isect_tiles(
-        means2d, radii, depths, tile_size, *tiles, packed=False, n_cameras=n_cameras
-    )
+    tiles = math.ceil(width / TILE), math.ceil(height / TILE)
+    _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, *tiles, packed=False, n_cameras=n_cameras)
     offsets = isect_offset_encode(isect_ids, n_cameras, *tiles)
-    render, alpha = rasterize_to_pixels(
+    image, alpha = rasterize_to_pixels(
         means2d,
         conics,
         channels,
         alphas.contiguous(),
         width,
         height,
-        tile_size,
+        TILE,
         offsets,
         flatten_ids,
         backgrounds=backgrounds,
-        absgrad=absgrad,
+        absgrad=options.absgrad,
     )
-    if render_mode.endswith("ED"):
-        render = torch.cat([render[..., :-1], render[..., -1:] / alpha.clamp_min(1e-10)], dim=-1)
-    info = {
-        "camera_ids": None,
-        "gaussian_ids": None,
-        "radii": radii,
-        "means2d": means2d,
-        "width": width,
-        "height": height,
-        "tile_size": tile_size,
-        "n_cameras": n_cameras,
-    }
-    return render, alpha, info
+    if options.render_mode.endswith("ED"):
+        image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], dim=-1)
+    return image, alpha, radii, means2d
+
+
+rasterization = make_rasterization(render)

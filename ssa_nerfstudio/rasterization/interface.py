@@ -1,28 +1,66 @@
-"""The signature that every rasterizer here has: gsplat's `rasterization`, around a function that blends splats."""
+"""The interface of all rasterizers here: arguments, checks and results of gsplat's `rasterization`.
+
+A body is a `Render`. `make_rasterization` wraps it in the signature, the argument checks and the `info` dictionary.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
-import torch
 from torch import Tensor
 
 from ssa_nerfstudio.rasterization import constants
-from ssa_nerfstudio.rasterization.projection import Splats, project
 
-Blend = Callable[[Splats, Tensor, int, int, int, bool], tuple[Tensor, Tensor]]
-"""`blend(splats, means2d, camera, width, height, absgrad)` returns color and depth [H, W, 4] and alpha [H, W, 1].
+RenderMode = Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"]
 
-`means2d` [C, N, 2] holds the splats' centers at `means2d[camera, splats.ids]`; gradients of the centers go through it,
-because densification reads them there (and, where `absgrad`, their sum of magnitudes as `means2d.absgrad`).
+
+class Gaussians(NamedTuple):
+    """N Gaussians in world space."""
+
+    means: Tensor  # [N, 3]
+    quats: Tensor  # [N, 4], w x y z, not necessarily normalized
+    scales: Tensor  # [N, 3], standard deviations
+    opacities: Tensor  # [N], in [0, 1]
+    colors: Tensor  # [N, 3], or [N, K, 3] with sh_degree
+
+
+class Cameras(NamedTuple):
+    """C pinhole cameras with one image size."""
+
+    viewmats: Tensor  # [C, 4, 4], world to camera, rigid, OpenCV axes
+    Ks: Tensor  # [C, 3, 3], pixels
+    width: int
+    height: int
+    backgrounds: Tensor | None  # [C, 3]
+
+
+@dataclass
+class RenderOptions:
+    """Options of a render, as `rasterization` in `make_rasterization` describes them."""
+
+    near_plane: float
+    far_plane: float
+    radius_clip: float
+    eps2d: float
+    sh_degree: int | None
+    render_mode: RenderMode
+    absgrad: bool
+    antialiased: bool
+
+
+Render = Callable[[Gaussians, Cameras, RenderOptions], tuple[Tensor, Tensor, Tensor, Tensor]]
+"""Returns render [C, H, W, X], alpha [C, H, W, 1], radii [C, N] int32 and means2d [C, N, 2].
+
+Gradients of the projected centers flow through means2d, because densification reads them there; with `absgrad`, the
+body leaves their summed magnitudes in `means2d.absgrad`.
 """
+Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
-def rasterization_with(
-    blend: Blend, project: Callable[..., Splats] = project
-) -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
-    """Make a `rasterization` function out of a blending and a projecting function (`projection.project`)."""
+def make_rasterization(render: Render) -> Rasterization:
+    """Wrap a body in gsplat's interface; its signature, documentation and checks are in this one place."""
 
     def rasterization(
         means: Tensor,  # [N, 3]
@@ -42,70 +80,55 @@ def rasterization_with(
         packed: bool = False,
         tile_size: int = constants.TILE,
         backgrounds: Tensor | None = None,  # [C, 3]
-        render_mode: Literal["RGB", "D", "ED", "RGB+D", "RGB+ED"] = "RGB",
+        render_mode: RenderMode = "RGB",
         sparse_grad: bool = False,
         absgrad: bool = False,
         rasterize_mode: Literal["classic", "antialiased"] = "classic",
     ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-        """Draw N Gaussians into C pinhole cameras: `gsplat.rasterization` with three color channels.
+        """Rasterize N Gaussians into C pinhole cameras: `gsplat.rasterization` 1.4.0 with three color channels.
 
         Args:
-            means, quats, scales, opacities: the Gaussians: world units; w x y z; standard deviations; [0, 1].
-            colors: final RGB [N, 3], or spherical harmonics [N, K, 3] where `sh_degree` is given.
-            viewmats, Ks: world to camera (OpenCV axes), intrinsics in pixels.
-            backgrounds: color behind the splats; black where None.
-            render_mode: D is alpha-weighted depth, ED the expected depth, along the view axis in world units.
+            means, quats, scales, opacities: as in `Gaussians`.
+            colors: RGB [N, 3], or coefficients of spherical harmonics [N, K, 3] with `sh_degree`.
+            viewmats, Ks, width, height: as in `Cameras`.
+            near_plane, far_plane: depths, in world units, between which the centers of drawn Gaussians lie.
+            radius_clip: Gaussians with a projected radius of at most this many pixels are not drawn.
+            eps2d: added to the diagonal of the projected covariance, square pixels.
+            sh_degree: degree up to which the coefficients are evaluated, (sh_degree + 1)^2 <= K; None for RGB.
+            packed, tile_size, sparse_grad: as in gsplat; only their defaults are supported.
+            backgrounds: color behind the Gaussians; black where None.
+            render_mode: RGB is the color, D the alpha-weighted depth, ED the expected depth, in world units.
             absgrad: leave the summed magnitudes of the centers' gradients in `info["means2d"].absgrad`.
+            rasterize_mode: "antialiased" scales opacities by sqrt(det / det with eps2d).
 
         Returns:
-            render [C, H, W, X] with X channels by `render_mode`, alpha [C, H, W, 1], and `info` with what
-            gsplat's densification strategies read: `radii` [C, N] int32, `means2d` [C, N, 2], `width`, `height`,
-            `n_cameras`, `gaussian_ids` and `camera_ids` (None: not packed), `tile_size`.
+            render [C, H, W, X] with X channels by `render_mode`; alpha [C, H, W, 1]; and `info` with what gsplat's
+            densification strategies read: `radii` [C, N] int32, 0 where not drawn, `means2d` [C, N, 2] in pixels,
+            `width`, `height`, `n_cameras`, `tile_size`, `gaussian_ids` and `camera_ids` (None: not packed).
 
         Raises:
-            ValueError: for what only the CUDA body can do (packed, sparse gradients, another tile size).
+            ValueError: an unsupported option, or colors of another shape.
         """
         if packed or sparse_grad or tile_size != constants.TILE:
-            raise ValueError("packed, sparse_grad and tile_size other than 16 exist on CUDA only; leave them out")
+            raise ValueError("packed, sparse_grad and tile sizes other than 16 are not supported; leave them out")
         if colors.shape[-1] != 3 or colors.dim() != (2 if sh_degree is None else 3):
             raise ValueError(
                 f"colors have shape {tuple(colors.shape)}; give [N, 3], or [N, K, 3] together with sh_degree"
             )
-        n_cameras, n_gaussians = viewmats.shape[0], means.shape[0]
-        views = [
-            project(
-                means,
-                quats,
-                scales,
-                opacities,
-                colors,
-                viewmats[camera],
-                Ks[camera],
-                width,
-                height,
-                near_plane=near_plane,
-                far_plane=far_plane,
-                radius_clip=radius_clip,
-                eps2d=eps2d,
-                sh_degree=sh_degree,
+        image, alpha, radii, means2d = render(
+            Gaussians(means, quats, scales, opacities, colors),
+            Cameras(viewmats, Ks, width, height, backgrounds),
+            RenderOptions(
+                near_plane,
+                far_plane,
+                radius_clip,
+                eps2d,
+                sh_degree,
+                render_mode,
+                absgrad,
                 antialiased=rasterize_mode == "antialiased",
-            )
-            for camera in range(n_cameras)
-        ]
-        means2d = torch.stack([means.new_zeros(n_gaussians, 2).index_copy(0, v.ids, v.means2d) for v in views])
-        radii = torch.zeros(n_cameras, n_gaussians, dtype=torch.int32, device=means.device)
-        for camera, view in enumerate(views):
-            radii[camera, view.ids] = view.radii
-        blended = [blend(view, means2d, camera, width, height, absgrad) for camera, view in enumerate(views)]
-        drawn = torch.stack([image for image, _ in blended])
-        alpha = torch.stack([a for _, a in blended])
-
-        rgb, depth = drawn[..., :3], drawn[..., 3:]
-        if backgrounds is not None:
-            rgb = rgb + (1.0 - alpha) * backgrounds[:, None, None, :]
-        if render_mode.endswith("ED"):
-            depth = depth / alpha.clamp_min(1e-10)
-        channels = {"RGB": [rgb], "D": [depth], "ED": [depth]}.get(render_mode, [rgb, depth])
+            ),
+        )
         info = {
             "camera_ids": None,
             "gaussian_ids": None,
@@ -114,8 +137,8 @@ def rasterization_with(
             "width": width,
             "height": height,
             "tile_size": tile_size,
-            "n_cameras": n_cameras,
+            "n_cameras": viewmats.shape[0],
         }
-        return (channels[0] if len(channels) == 1 else torch.cat(channels, dim=-1)), alpha, info
+        return image, alpha, info
 
     return rasterization

@@ -1,22 +1,25 @@
-"""From Gaussians in the world to splats on the image: projection, view-dependent color, culling. Differentiable torch.
+"""Projection of Gaussians to splats on the image, with view-dependent color and culling, in differentiable torch.
 
-The mathematics is gsplat's own `_torch_impl`, called and not copied. Gaussians in front of the near plane are selected
-*before* projecting: the perspective division of one at the camera center yields infinities whose gradients are NaN,
-and culled Gaussians should cost nothing.
+The mathematics is gsplat's own `_torch_impl`. Gaussians behind the near plane are culled *before* the projection: the
+perspective division of one at the camera center yields infinities whose gradients are NaN, and culled Gaussians should
+cost nothing.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci, _spherical_harmonics
 from torch import Tensor
 
+from ssa_nerfstudio.rasterization.interface import Gaussians, RenderOptions
+
 
 @dataclass
 class Splats:
-    """The Gaussians of one camera that touch its image, nearest first. V of the N Gaussians are left."""
+    """The V of N Gaussians that touch one camera's image, nearest first."""
 
     ids: Tensor  # [V] int64, index into the N Gaussians, in order of depth (ties: of index)
     radii: Tensor  # [V] int32, half the side of the three-sigma square in pixels, at least 1
@@ -26,38 +29,29 @@ class Splats:
     colors: Tensor  # [V, 4], red, green, blue (not clamped above) and depth in world units
 
 
+Project = Callable[[Gaussians, Tensor, Tensor, int, int, RenderOptions], Splats]
+"""The signature of `project`."""
+
+
 def project(
-    means: Tensor,  # [N, 3]
-    quats: Tensor,  # [N, 4], w x y z, not necessarily normalized
-    scales: Tensor,  # [N, 3]
-    opacities: Tensor,  # [N]
-    colors: Tensor,  # [N, 3] or [N, K, 3]
-    viewmat: Tensor,  # [4, 4]
-    K: Tensor,  # [3, 3]
-    width: int,
-    height: int,
-    *,
-    near_plane: float,
-    far_plane: float,
-    radius_clip: float,
-    eps2d: float,
-    sh_degree: int | None,
-    antialiased: bool,
+    gaussians: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int, options: RenderOptions
 ) -> Splats:
     """Project the Gaussians that one pinhole camera sees.
 
     Args:
-        sh_degree: None where `colors` are final [N, 3]; else the degree up to which the coefficients
-            [N, K, 3] are evaluated, (sh_degree + 1)^2 <= K.
-        radius_clip: splats with a radius of at most this many pixels are dropped.
-        antialiased: scale the opacities by sqrt(det / det with eps2d), as gsplat's "antialiased" mode does.
+        gaussians: the Gaussians in world space.
+        viewmat: world to camera [4, 4], rigid.
+        K: intrinsics [3, 3], pixels.
+        width, height: of the image, pixels.
+        options: clipping planes, radius_clip, eps2d, sh_degree and antialiased apply.
 
     Returns:
         The visible splats in order of depth.
     """
+    means, quats, scales, opacities, colors = gaussians
     with torch.no_grad():
         depths = means @ viewmat[2, :3] + viewmat[2, 3]
-        in_front = torch.nonzero((depths > near_plane) & (depths < far_plane)).squeeze(-1)
+        in_front = torch.nonzero((depths > options.near_plane) & (depths < options.far_plane)).squeeze(-1)
     near = _Selection(in_front, means.shape[0])
     means, quats, scales = near(means), near(quats), near(scales)
     covars, _ = _quat_scale_to_covar_preci(quats, scales, compute_preci=False)
@@ -68,25 +62,25 @@ def project(
         K[None],
         width,
         height,
-        eps2d=eps2d,
-        near_plane=near_plane,
-        far_plane=far_plane,
-        calc_compensations=antialiased,
+        eps2d=options.eps2d,
+        near_plane=options.near_plane,
+        far_plane=options.far_plane,
+        calc_compensations=options.antialiased,
     )
     with torch.no_grad():
-        drawn = torch.nonzero(radii[0] > radius_clip).squeeze(-1)
+        drawn = torch.nonzero(radii[0] > options.radius_clip).squeeze(-1)
         order = drawn[torch.sort(depths[0, drawn], stable=True).indices]
     ids = in_front[order]
     alphas = opacities[ids]
     if compensations is not None:
         alphas = alphas * compensations[0, order]
     depth = depths[0, order]
-    if sh_degree is None:
+    if options.sh_degree is None:
         rgb = colors[ids]
     else:
         directions = means[order] - _camera_center(viewmat)
-        bases = (sh_degree + 1) ** 2
-        rgb = _spherical_harmonics(sh_degree, directions, colors[:, :bases][ids])
+        bases = (options.sh_degree + 1) ** 2
+        rgb = _spherical_harmonics(options.sh_degree, directions, colors[:, :bases][ids])
         rgb = torch.clamp_min(rgb + 0.5, 0.0)
     return Splats(
         ids=ids,
@@ -99,7 +93,7 @@ def project(
 
 
 class _Selection:
-    """Index the first dimension, without a copy where everything is selected."""
+    """Index along the first dimension; no copy where everything is selected."""
 
     def __init__(self, ids: Tensor, total: int) -> None:
         self.ids = ids

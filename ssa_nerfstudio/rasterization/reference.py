@@ -1,6 +1,6 @@
-"""The oracle: blending as a loop over tiles in plain torch, differentiated by autograd, in any float dtype.
+"""The reference rasterizer: a loop over tiles in plain torch, differentiated by autograd, in any float dtype.
 
-Slow on purpose: it states what the other bodies have to compute, and is the baseline of the rasterizer benchmark.
+It is slow and defines what the other bodies compute; tests and the rasterizer benchmark compare them with it.
 """
 
 from __future__ import annotations
@@ -8,21 +8,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.rasterization.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
-from ssa_nerfstudio.rasterization.interface import rasterization_with
-from ssa_nerfstudio.rasterization.projection import Splats
+from ssa_nerfstudio.rasterization.interface import make_rasterization
+from ssa_nerfstudio.rasterization.projection import Splats, project
+from ssa_nerfstudio.rasterization.splatting import project_and_blend
 
 
 def blend(
     splats: Splats, means2d: Tensor, camera: int, width: int, height: int, absgrad: bool
 ) -> tuple[Tensor, Tensor]:
-    """Blend one camera's splats, front to back: C = sum_i c_i alpha_i prod_{j<i} (1 - alpha_j). See `interface.Blend`.
+    """Blend a camera's splats, front to back: C = sum_i c_i alpha_i prod_{j<i} (1 - alpha_j). See `splatting.Blend`.
 
     Raises:
-        ValueError: where `absgrad` is asked for; autograd knows sums of gradients, not of their magnitudes.
+        InputError: with `absgrad`; autograd sums gradients, not their magnitudes.
     """
     if absgrad:
-        raise ValueError("the reference rasterizer has no absgrad; set use_absgrad to False or use the cpu rasterizer")
+        raise InputError(
+            "the reference rasterizer has no absgrad", "set use_absgrad to False or use the cpu rasterizer"
+        )
     centers = means2d[camera, splats.ids]
     image = centers.new_zeros(height, width, 4)
     alpha = centers.new_zeros(height, width, 1)
@@ -52,7 +56,7 @@ def _blend_tile(
     sigma = 0.5 * (xx * dx**2 + yy * dy**2) + xy * dx * dy  # [n, h, w]
     alphas = (splats.opacities[here, None, None] * torch.exp(-sigma)).clamp_max(ALPHA_MAX)
     alphas = torch.where((sigma >= 0) & (alphas >= ALPHA_MIN), alphas, torch.zeros_like(alphas))
-    # The splat that would bring the transmittance to the threshold is not drawn, nor any behind it.
+    # The splat that would reduce the transmittance to the threshold is not drawn, nor any behind it.
     after = torch.cumprod(1.0 - alphas, dim=0)
     alphas = torch.where(after > TRANSMITTANCE_MIN, alphas, torch.zeros_like(alphas))
     after = torch.cumprod(1.0 - alphas, dim=0)
@@ -62,4 +66,4 @@ def _blend_tile(
     return color, weights.sum(dim=0)[..., None]
 
 
-rasterization = rasterization_with(blend)
+rasterization = make_rasterization(project_and_blend(project, blend))

@@ -1,8 +1,9 @@
-"""The numba projection gives the splats, and pulls back the gradients, of the projection in plain torch."""
+"""The numba projection against the projection in plain torch: splats and gradients."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -12,12 +13,12 @@ from hypothesis import strategies as st
 from rasterization_scenes import BODIES, TOLERANCE, Scene, cast, scene, view
 from torch import Tensor
 
-from benchmarks.rasterizers import draw, relative_error
+from benchmarks.rasterizers import OPTIONS, draw, relative_error
 from ssa_nerfstudio.rasterization import cpu_projection, projection
+from ssa_nerfstudio.rasterization.interface import Gaussians
 from ssa_nerfstudio.rasterization.projection import Splats
 
 WIDTH, HEIGHT = 40, 30
-DEFAULTS = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3, "antialiased": False}
 FIELDS = ("means2d", "conics", "opacities", "colors")
 
 
@@ -26,7 +27,7 @@ def project_and_pull_back(
 ) -> tuple[Splats, dict[str, Tensor]]:
     """The splats of the first camera, and the gradient of every parameter for fixed random cotangents."""
     leaves = {name: value.clone().requires_grad_() for name, value in made[0].items()}
-    splats = project(*leaves.values(), made[1][0], made[2][0], WIDTH, HEIGHT, **{"sh_degree": 3, **DEFAULTS, **options})
+    splats = project(Gaussians(**leaves), made[1][0], made[2][0], WIDTH, HEIGHT, replace(OPTIONS, **options))
     generator = torch.Generator().manual_seed(2)
     total = torch.zeros((), dtype=made[1].dtype)
     for name in FIELDS:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,10 @@ from rasterization_scenes import BODIES, Scene, scene, view
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from benchmarks.rasterizers import OPTIONS
 from ssa_nerfstudio.rasterization import constants, reference
+from ssa_nerfstudio.rasterization.interface import Gaussians
 from ssa_nerfstudio.rasterization.projection import project
-
-DEFAULTS = {"near_plane": 0.01, "far_plane": 1e10, "radius_clip": 0.0, "eps2d": 0.3, "antialiased": False}
 
 
 def draw_pixel_by_pixel(
@@ -121,7 +122,7 @@ def smooth_scene(width: int, height: int) -> Scene:
     gaussians["opacities"] = 0.3 + 0.4 * gaussians["opacities"]
     gaussians["colors"] = 0.3 * gaussians["colors"]
     viewmats = view(0.3)[None]
-    splats = project(*gaussians.values(), viewmats[0], Ks[0], width, height, sh_degree=1, **DEFAULTS)  # pyright: ignore[reportCallIssue]
+    splats = project(Gaussians(**gaussians), viewmats[0], Ks[0], width, height, replace(OPTIONS, sh_degree=1))
     y, x = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     dx, dy = x[None] - splats.means2d[:, 0, None, None], y[None] - splats.means2d[:, 1, None, None]
     xx, xy, yy = (splats.conics[:, k, None, None] for k in range(3))
