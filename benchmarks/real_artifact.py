@@ -20,7 +20,7 @@ from PIL import Image
 from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.experiments.runs.training_run import configure, model_settings, train_and_evaluate
-from ssa_nerfstudio.metrics.image import matte_iou
+from ssa_nerfstudio.metrics.matte import matte_iou
 
 MASK = "artifact_mask_approx.png"
 """The mask's name in the dataset."""

@@ -1,4 +1,4 @@
-"""How close a render is to the photo, and a matte to the artifact: pure functions on torch images."""
+"""Image metrics between a render and a photo: pure functions on torch images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 """Standard deviation of the Gaussian window of `ssim`, in pixels."""
 RANGE_TOLERANCE = 1e-6
-"""How far outside [0, 1] a value may lie and still be taken for rounding; such values are clipped."""
+"""Values this far outside [0, 1] are taken for rounding and clipped."""
 
 
 def psnr(render: Tensor, target: Tensor) -> float:
@@ -30,7 +30,7 @@ def psnr(render: Tensor, target: Tensor) -> float:
         Decibels; `inf` where the images are equal.
 
     Raises:
-        ValueError: an image is no finite floating-point [H, W, 3] in [0, 1], or the shapes differ.
+        ValueError: an image is not a finite floating-point [H, W, 3] in [0, 1], or the shapes differ.
     """
     render, target = _image_pair(render, target)
     mean_squared_error = (render - target).square().mean().item()
@@ -40,9 +40,8 @@ def psnr(render: Tensor, target: Tensor) -> float:
 def ssim(render: Tensor, target: Tensor) -> float:
     """Structural similarity with an 11 x 11 Gaussian window of sigma 1.5 and "valid" padding.
 
-    "Valid": only windows that lie wholly inside the image count, so the outer 5 pixels are never a window's
-    center. torchmetrics, and with it `ns-eval`, pads by reflection instead; its numbers differ slightly. Mean over
-    channels and windows. Wang et al. 2004, "Image quality assessment: from error visibility to structural
+    Only windows inside the image count, so the outer 5 pixels are never a window's center. torchmetrics, and with it
+    `ns-eval`, pads by reflection instead; its values differ slightly. Mean over channels and windows. Wang et al. 2004, "Image quality assessment: from error visibility to structural
     similarity", with K1 = 0.01 and K2 = 0.03.
 
     Args:
@@ -58,7 +57,7 @@ def ssim(render: Tensor, target: Tensor) -> float:
     render, target = _image_pair(render, target)
     if min(render.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs images of at least {SSIM_WINDOW} x {SSIM_WINDOW}, got {tuple(render.shape)}")
-    # The library's own window has single precision: it sums to 1 only within 1e-7, which flat regions show.
+    # The library's own window has single precision and sums to 1 only within 1e-7, which shows in flat regions.
     offsets = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     window = torch.softmax(-offsets.square() / (2 * SSIM_SIGMA**2), dim=0).expand(3, 1, 1, -1)
     return windowed_ssim(
@@ -85,7 +84,13 @@ def flip(render: Tensor, target: Tensor) -> float:
 
 
 def flip_arrays(render: Tensor, target: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The two images [H, W, 3] as `flip_error` takes them, reference first.
+    """Convert two images to the arguments of `flip_error`.
+
+    Args:
+        render, target: as for `flip`.
+
+    Returns:
+        Reference and test, float32 [H, W, 3], contiguous.
 
     Raises:
         ValueError: as `psnr`.
@@ -98,8 +103,8 @@ def flip_arrays(render: Tensor, target: Tensor) -> tuple[np.ndarray, np.ndarray]
 def mean_color_deviation(render: Tensor, target: Tensor) -> float:
     """Distance between the two images' mean colors, the paper's Delta c-bar.
 
-    The 2-norm of the difference of mean RGB on the 0..255 scale. It shows a near-uniform tint or exposure
-    shift that hardly moves PSNR or SSIM.
+    The 2-norm of the difference of mean RGB on the 0..255 scale. It reveals a near-uniform tint or exposure shift that
+    hardly changes PSNR or SSIM.
 
     Args:
         render: image [H, W, 3], floating point, in [0, 1].
@@ -115,62 +120,26 @@ def mean_color_deviation(render: Tensor, target: Tensor) -> float:
     return 255 * torch.linalg.vector_norm((render - target).mean(dim=(0, 1))).item()
 
 
-def matte_iou(alpha: Tensor, mask: Tensor, threshold: float = 0.5) -> float:
-    """Intersection over union of a thresholded matte and the true mask.
-
-    Args:
-        alpha: matte A [H, W], floating point, in [0, 1].
-        mask: true artifact mask [H, W], bool.
-        threshold: a pixel counts as artifact where alpha > threshold; in [0, 1).
-
-    Returns:
-        A number in [0, 1]; 1 where both are empty.
-
-    Raises:
-        ValueError: alpha is no finite floating-point [H, W] in [0, 1], mask is not bool or of another shape,
-            or the threshold is out of range.
-    """
-    alpha = _checked(alpha, "alpha", dimensions=2)
-    if mask.dtype != torch.bool or mask.shape != alpha.shape:
-        raise ValueError(f"mask must be bool {tuple(alpha.shape)}, got {mask.dtype} {tuple(mask.shape)}")
-    if not 0 <= threshold < 1:
-        raise ValueError(f"threshold must be in [0, 1), got {threshold}")
-    found, true = alpha > threshold, mask.to(alpha.device)
-    union = (found | true).sum().item()
-    return 1.0 if union == 0 else (found & true).sum().item() / union
-
-
-def matte_error(alpha: Tensor, target: Tensor) -> float:
-    """Mean absolute error between two mattes.
-
-    Args:
-        alpha: matte A [H, W], floating point, in [0, 1].
-        target: true matte [H, W], same range.
-
-    Returns:
-        A number in [0, 1].
-
-    Raises:
-        ValueError: a matte is no finite floating-point [H, W] in [0, 1], or the shapes differ.
-    """
-    alpha, target = _checked(alpha, "alpha", dimensions=2), _checked(target, "target", dimensions=2)
-    if alpha.shape != target.shape:
-        raise ValueError(f"alpha {tuple(alpha.shape)} and target {tuple(target.shape)} differ in shape")
-    return (alpha - target.to(alpha.device)).abs().mean().item()
-
-
 def _image_pair(render: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    render, target = _checked(render, "render", dimensions=3), _checked(target, "target", dimensions=3)
+    render, target = checked_unit_range(render, "render", 3), checked_unit_range(target, "target", 3)
     if render.shape != target.shape:
         raise ValueError(f"render {tuple(render.shape)} and target {tuple(target.shape)} differ in shape")
     return render, target.to(render.device)
 
 
-def _checked(image: Tensor, name: str, dimensions: int) -> Tensor:
-    """The image in float64, clipped to [0, 1].
+def checked_unit_range(image: Tensor, name: str, dimensions: int) -> Tensor:
+    """Check an image or a matte and convert it to float64, clipped to [0, 1].
 
-    Double precision because single-precision convolutions run as TF32 on recent GPUs and the variance inside
-    SSIM is a difference of close numbers.
+    Double precision because single-precision convolutions run as TF32 on recent GPUs and the variance inside SSIM is a
+    difference of close numbers.
+
+    Args:
+        image: [H, W, 3] or [H, W], floating point.
+        name: of the argument, for messages.
+        dimensions: 3 for [H, W, 3], 2 for [H, W].
+
+    Raises:
+        ValueError: another shape or dtype, values that are not finite, or values outside [0, 1].
     """
     expected = "[H, W, 3]" if dimensions == 3 else "[H, W]"
     if image.ndim != dimensions or (dimensions == 3 and image.shape[2] != 3) or image.numel() == 0:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 
-from ssa_nerfstudio.metrics import image as metrics
+from ssa_nerfstudio.metrics.matte import matte_error, matte_iou
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 
@@ -44,8 +44,8 @@ def score(overlay: ScreenSpaceOverlay, transmittance: np.ndarray, addition: np.n
     matte = torch.from_numpy(np.maximum(1 - transmitted[..., 0], added.max(axis=2))).clamp(0, 1)
     target = torch.from_numpy(np.ascontiguousarray(true_matte))
     return {
-        "matte_error": metrics.matte_error(matte, target),
-        "matte_iou": metrics.matte_iou(matte, target > 0.5),
+        "matte_error": matte_error(matte, target),
+        "matte_iou": matte_iou(matte, target > 0.5),
         "premultiplied_error": float(np.abs(added - truth_b).mean()),
         "transmittance_error": float(np.abs(transmitted - truth_t).mean()),
     }
