@@ -34,7 +34,9 @@ def layers() -> list[list[str]]:
 
 def imports() -> dict[str, set[str]]:
     """For each folder, the folders and the framework that its modules import directly."""
-    graph = grimp.build_graph(PACKAGE, include_external_packages=True, cache_dir=None)
+    graph = grimp.build_graph(
+        PACKAGE, include_external_packages=True, exclude_type_checking_imports=True, cache_dir=None
+    )
     names = {name for row in layers() for name in row}
     found: dict[str, set[str]] = {name: set() for name in names}
     for module in graph.modules:
