@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
-from nerfstudio.models.splatfacto import RGB2SH, SplatfactoModel
+from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -23,8 +23,9 @@ from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.compat.upstream import without_lpips
 from ssa_nerfstudio.plugin.evaluation import figures_of_step, figures_of_view, pictures_of_view
 from ssa_nerfstudio.plugin.settings import ModelSettings
-from ssa_nerfstudio.plugin.training import nonfinite as guards
-from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.training import nonfinite
+from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
+from ssa_nerfstudio.plugin.training.seed_points import MIN_DISTANCE, color_parameters, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, in_viewer
 from ssa_nerfstudio.rasterization import rasterizer
@@ -50,7 +51,7 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def populate_modules(self) -> None:
         """Build splatfacto's Gaussians without CUDA and without downloads, then what is ours."""
-        points = self.seed_points = guards.usable_points(self.seed_points)
+        points = self.seed_points = nonfinite.finite_points(self.seed_points)
         if points is not None:
             # Upstream moves seed colors to CUDA (splatfacto.py:261); given none, it starts from random ones.
             self.seed_points = (points[0], points[1][:0])
@@ -58,41 +59,19 @@ class SSASplatfactoModel(SplatfactoModel):
             super().populate_modules()
         del self.lpips
         self.seed_points = points
-        guards.give_sizes_to_points_without(self.scales.data)
+        nonfinite.replace_nonfinite_scales(self.scales.data)
         if points is not None and not self.config.random_init and len(points[1]):
-            colors = points[1].float() / 255.0
-            dc = RGB2SH(colors) if self.config.sh_degree > 0 else torch.logit(colors, eps=1e-6)
-            self.gauss_params["features_dc"] = Parameter(dc)
+            self.gauss_params["features_dc"] = Parameter(color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
         self.metrics_every = 10
-        self._make_strategy()
+        self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
+        self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
         if self.config.rasterizer in ("auto", "cpu") and not torch.cuda.is_available():
             from ssa_nerfstudio.rasterization.cpu import compile_kernels
 
             compile_kernels()
-
-    def _make_strategy(self) -> None:
-        config = self.config
-        if config.strategy == "mcmc":
-            self.strategy = MarkovChainMonteCarlo(
-                cap_max=config.cap_max,
-                refine_start_iter=config.warmup_length,
-                refine_stop_iter=config.mcmc_stop_at,
-                refine_every=config.refine_every,
-                guarded=config.guards,
-            )
-            with torch.no_grad():
-                self.opacities.fill_(torch.tensor(config.mcmc_opacity_start).logit())
-                self.scales.add_(torch.tensor(config.mcmc_scale_start).log())
-        else:
-            self.strategy = AdaptiveDensityControl(
-                **{**vars(self.strategy), "verbose": False, "guarded": config.guards}
-            )
-            if config.pause_after_reset is not None:
-                self.strategy.pause_refine_after_reset = config.pause_after_reset
-        self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
 
     @property
     def overlay(self) -> ArtifactControls | None:
@@ -111,12 +90,12 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def start_outside_cameras(self, positions: Tensor) -> None:
         """Leave out start points that are inside a camera at positions [V, 3]. Before the optimizers are built."""
-        outside = guards.outside_cameras(self.means.data, positions)
+        outside = outside_cameras(self.means.data, positions)
         if not self.config.guards or outside.all():
             return
         if not outside.any():
             _LOG.warning(
-                f"every start point is within {guards.START_DISTANCE} of a camera, nearer than any is drawn: the scene "
+                f"every start point is within {MIN_DISTANCE} of a camera, nearer than any is drawn: the scene "
                 "is too small; leave --pipeline.datamanager.dataparser.auto-scale-poses True"
             )
             return
@@ -134,8 +113,8 @@ class SSASplatfactoModel(SplatfactoModel):
         """After the optimizers' step: bring parameters back into their range, then densify."""
         for overlay in self.artifacts.learned():
             overlay.restore_held()
-        if self.config.guards and step % guards.RANGE_EVERY == 0:
-            guards.keep_scales_in_range(self.scales)
+        if self.config.guards and step % nonfinite.CLAMP_EVERY == 0:
+            nonfinite.clamp_scales(self.scales)
             for overlay in self.artifacts.learned():
                 overlay.clamp_logits()
         super().step_post_backward(step)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Literal
 
+import torch
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerConfig
@@ -18,7 +20,7 @@ from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.training.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
 from ssa_nerfstudio.plugin.training.event_writers import spare_event_writers
-from ssa_nerfstudio.plugin.training.nonfinite import READ_EVERY, SeedingScaler, StepGuard, first_not_finite
+from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.training.schedules import scaled
 from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device
@@ -72,12 +74,7 @@ class SSATrainer(Trainer):
             means["optimizer"].lr *= scale
             means["scheduler"].lr_final *= scale
         model = self.config.pipeline.model
-        guard = None
-        if model.guards:
-            scaling = self.grad_scaler.is_enabled()
-            gathering = any(steps > 1 for steps in self.gradient_accumulation_steps.values())
-            guard = StepGuard(model.max_skipped_steps, magnified=not (scaling or gathering))
-            self.grad_scaler = SeedingScaler(guard, scaling)
+        guard = NonFiniteGuard(model.max_skipped_steps) if model.guards else None
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), guard)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
@@ -132,15 +129,16 @@ class SSATrainer(Trainer):
             raise  # of the settings: no other checkpoint helps
         except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError) as error:
             return (str(error) or type(error).__name__).splitlines()[0]
-        broken = first_not_finite(self.pipeline.state_dict())
+        broken = first_nonfinite(self.pipeline.state_dict())
         return None if broken is None else f"its {broken} holds values that are not finite"
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
         """Write a checkpoint, whole and finite or not at all; older ones go only when it is there."""
-        self.optimizers.look(step)
+        if self.optimizers.guard is not None:
+            self.optimizers.guard.check(step)
         states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
-        broken = first_not_finite({**self.pipeline.state_dict(), **states})
+        broken = first_nonfinite({**self.pipeline.state_dict(), **states})
         if broken is not None:
             raise TrainingError(
                 f"training stopped at step {step}: {broken} holds values that are not finite, so no checkpoint was "
@@ -166,14 +164,30 @@ class SSATrainer(Trainer):
                     path.unlink()
 
     def train_iteration(self, step: int) -> TRAIN_INTERATION_OUTPUT:
-        """One step; what is logged is cut off from the graph, which upstream keeps alive until the log is written."""
-        loss, losses, metrics = super().train_iteration(step)
-        guard = self.optimizers.guard
-        if guard is not None:
-            self.pipeline.model.info |= {"skipped": guard.skipped, "magnification": guard.magnification}
-            if (step + 1) % READ_EVERY == 0:
-                self.optimizers.look(step)
-        return loss.detach(), {name: value.detach() for name, value in losses.items()}, metrics
+        """One training step: forward, backward, one verdict for all optimizers, schedulers.
+
+        What is returned is detached: upstream keeps the graph alive until the log is written.
+        """
+        optimizers, every = self.optimizers, self.gradient_accumulation_steps
+        optimizers.zero_grad_some([name for name in optimizers.parameters if step % every[name] == 0])
+        with torch.autocast(device_type="cuda" if "cuda" in self.device else "cpu", enabled=self.mixed_precision):
+            _, losses, metrics = self.pipeline.get_train_loss_dict(step=step)
+            loss = reduce(torch.add, losses.values())
+        self.grad_scaler.scale(loss).backward()
+        loss = loss.detach()
+        due = [name for name in optimizers.parameters if step % every[name] == every[name] - 1]
+        optimizers.step_groups(due, loss, self.grad_scaler)
+        if self.config.log_gradients:
+            metrics |= _gradient_norms(self.pipeline.model)
+        scale = self.grad_scaler.get_scale()
+        self.grad_scaler.update()
+        if scale <= self.grad_scaler.get_scale():  # a scaler that is lowered has skipped the step
+            optimizers.scheduler_step_all(step)
+        if optimizers.guard is not None:
+            optimizers.guard.mask_densification(self.pipeline.model.info)
+            if (step + 1) % CHECK_EVERY == 0:
+                optimizers.guard.check(step)
+        return loss, {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:
         """Train up to max_num_iterations steps in all; upstream's resumed runs train that many more."""
@@ -185,8 +199,12 @@ class SSATrainer(Trainer):
         super().train()
 
 
+def _gradient_norms(model: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """2-norm of every parameter's gradient, and their sum, under nerfstudio's names."""
+    norms = {f"Gradients/{name}": p.grad.norm() for name, p in model.named_parameters() if p.grad is not None}
+    return {**norms, "Gradients/Total": reduce(torch.add, norms.values())}
+
+
 def machine() -> MachineConfig:
     """CUDA where torch has it, else the CPU."""
-    import torch
-
     return MachineConfig(device_type="cuda" if torch.cuda.is_available() else "cpu")

@@ -1,8 +1,7 @@
 """open3d's wheels link to libusb and do not bring it; slim systems have none, and then nerfstudio cannot read points.
 
-`preload` serves every command that imports the plugin before open3d. `ns-export` imports open3d first of all, which is
-why `python -m ssa_nerfstudio.plugin.compat.open3d_libraries` (part of `make setup`) puts the library beside open3d instead.
-May go when open3d's wheels bring it.
+`preload` serves commands that import the plugin before open3d. `ns-export` imports open3d first, which is why `make
+setup` runs this module: it copies the library beside open3d. May go when open3d's wheels bring it.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 # pyright: reportArgumentType=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false, reportIndexIssue=false
 # (Triton's kernels are no Python to a type checker.)
-"""MCMC's noise on CUDA, in one kernel. See `noise.perturb`."""
+"""`langevin_noise.perturb` on CUDA, in one kernel."""
 
 from __future__ import annotations
 
@@ -11,39 +11,42 @@ from torch import Tensor
 _BLOCK = 256
 
 
-def move(
+def perturb_means(
     means: Tensor,
     quats: Tensor,
     scales: Tensor,
     opacities: Tensor,
     normals: Tensor,
     rate: float,
-    skipped: Tensor | None,
+    scale: Tensor | None,
 ) -> None:
-    """`noise.perturb` with normals [N, 3] that are drawn already; all contiguous float32 on the device."""
+    """`langevin_noise.perturb` with given normals [N, 3]; all contiguous float32 on the device."""
     n = len(means)
-    skips = normals if skipped is None else skipped
-    _move[(triton.cdiv(n, _BLOCK),)](
-        means, quats, scales, opacities, normals, skips, rate, n, skipped is not None, _BLOCK
+    factor = normals if scale is None else scale  # any pointer, where it is not read
+    _perturb[(triton.cdiv(n, _BLOCK),)](
+        means, quats, scales, opacities, normals, factor, rate, n, scale is not None, _BLOCK
     )  # fmt: skip
 
 
-@triton.jit(do_not_specialize=["n", "skipped"])  # which change: no version of the kernel for each kind of them
-def _move(
-    means, quats, scales, opacities, normals, skipped, rate, n, GUARDED: tl.constexpr, BLOCK: tl.constexpr
+@triton.jit(do_not_specialize=["n", "factor"])  # both change: one compilation for all of their values
+def _perturb(
+    means, quats, scales, opacities, normals, factor, rate, n, SCALED: tl.constexpr, BLOCK: tl.constexpr
 ):  # fmt: skip
-    """mu += rate sigmoid(100 (0.005 - o)) R S^2 R^T eta, without ever writing the covariance down."""
+    """mu += rate sigmoid(100 (0.005 - o)) R S^2 R^T eta, without storing the covariance."""
     i = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
-    if GUARDED:
-        inside = inside & (tl.load(skipped + 0 * i) == 0)
+    amplitude = rate
+    if SCALED:
+        scale = tl.load(factor)
+        inside = inside & (scale != 0)  # a scale of 0 changes nothing, whatever the Gaussian holds
+        amplitude = rate * scale
     opacity = tl.sigmoid(tl.load(opacities + i, mask=inside, other=0.0))
-    size = rate / (1.0 + tl.exp(100.0 * (opacity - 0.005)))
+    size = amplitude / (1.0 + tl.exp(100.0 * (opacity - 0.005)))
     w = tl.load(quats + 4 * i, mask=inside, other=1.0)
     x = tl.load(quats + 4 * i + 1, mask=inside, other=0.0)
     y = tl.load(quats + 4 * i + 2, mask=inside, other=0.0)
     z = tl.load(quats + 4 * i + 3, mask=inside, other=0.0)
-    two = 2.0 / tl.maximum(w * w + x * x + y * y + z * z, 1e-30)  # a quaternion of zeros turns nothing
+    two = 2.0 / tl.maximum(w * w + x * x + y * y + z * z, 1e-30)  # a zero quaternion rotates nothing
     xx, xy, xz = 1.0 - two * (y * y + z * z), two * (x * y - w * z), two * (x * z + w * y)
     yx, yy, yz = two * (x * y + w * z), 1.0 - two * (x * x + z * z), two * (y * z - w * x)
     zx, zy, zz = two * (x * z - w * y), two * (y * z + w * x), 1.0 - two * (x * x + y * y)

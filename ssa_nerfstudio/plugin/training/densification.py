@@ -1,7 +1,7 @@
-"""How the Gaussians multiply: adaptive density control (ADC) and MCMC, gsplat's strategies behind the same four calls.
+"""Densification: gsplat's adaptive density control (ADC) and MCMC behind one interface.
 
-Both answer `initialize_state(scene_scale)`, `step_pre_backward(...)` and `step_post_backward(...)` with the arguments
-that `SplatfactoModel` passes, and have `absgrad`, so that the model does not know which one it holds.
+Both have `initialize_state(scene_scale)`, `step_pre_backward(...)` and `step_post_backward(...)` with the arguments
+that `SplatfactoModel` passes, and `absgrad`, so that the model need not know which one it holds.
 """
 
 from __future__ import annotations
@@ -13,21 +13,50 @@ from typing import Any
 import torch
 from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from torch import Tensor
+from torch.nn import ParameterDict
 
+from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
-from ssa_nerfstudio.plugin.training.nonfinite import bury_broken
+from ssa_nerfstudio.plugin.training.nonfinite import mark_for_removal
+
+
+def make_strategy(
+    settings: ModelSettings, defaults: dict[str, Any], params: ParameterDict
+) -> AdaptiveDensityControl | MarkovChainMonteCarlo:
+    """Make the strategy that the settings name; MCMC also sets the opacities and scales that it starts from.
+
+    Args:
+        settings: the model's.
+        defaults: fields of splatfacto's own `DefaultStrategy`, which ADC takes over.
+        params: of the Gaussians, changed in place under MCMC.
+    """
+    if settings.strategy == "adc":
+        strategy = AdaptiveDensityControl(**{**defaults, "verbose": False, "guarded": settings.guards})
+        if settings.pause_after_reset is not None:
+            strategy.pause_refine_after_reset = settings.pause_after_reset
+        return strategy
+    with torch.no_grad():
+        params["opacities"].fill_(torch.tensor(settings.mcmc_opacity_start).logit())
+        params["scales"].add_(torch.tensor(settings.mcmc_scale_start).log())
+    return MarkovChainMonteCarlo(
+        cap_max=settings.cap_max,
+        refine_start_iter=settings.warmup_length,
+        refine_stop_iter=settings.mcmc_stop_at,
+        refine_every=settings.refine_every,
+        guarded=settings.guards,
+    )
 
 
 @dataclass
 class AdaptiveDensityControl(DefaultStrategy):
-    """gsplat's DefaultStrategy (3DGS, Kerbl et al. 2023), with statistics that need no host synchronization.
+    """gsplat's DefaultStrategy (3DGS, Kerbl et al. 2023) with statistics that need no host synchronization.
 
-    gsplat 1.4.0 resets opacities at step 0 too (`step % reset_every == 0`). Here that reset is left out: it exists to
-    expose floaters, of which there are none before the first step, and the original implementation has none either.
+    gsplat 1.4.0 also resets opacities at step 0 (`step % reset_every == 0`). This one does not: a reset exposes
+    floaters, and there are none before the first step.
     """
 
     guarded: bool = True
-    """Leave skipped steps out of the statistics, remove Gaussians that are not finite, and never remove the last."""
+    """Remove Gaussians that are not finite, and never remove the last ones."""
 
     def step_post_backward(
         self,
@@ -45,7 +74,7 @@ class AdaptiveDensityControl(DefaultStrategy):
         super().step_post_backward(params, optimizers, state, step, info, packed)
 
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """The same sums as gsplat's, over all Gaussians with zeros where invisible, instead of over a compacted list.
+        """Add to gsplat's sums, with zeros for invisible Gaussians instead of a compacted list of visible ones.
 
         Compaction (`torch.where`) waits for the device at every training step.
         """
@@ -57,14 +86,10 @@ class AdaptiveDensityControl(DefaultStrategy):
             state["count"] = gradients.new_zeros(gradients.shape[1])
         if self.refine_scale2d_stop_iter > 0 and state["radii"] is None:
             state["radii"] = gradients.new_zeros(gradients.shape[1])
-        least = 0
-        if self.guarded and info.get("skipped") is not None:
-            # The float 1 of a skipped step is 0x3f800000 as an integer: no radius is larger, nothing counts as visible.
-            least = info["skipped"].view(torch.int32)
         width, height = info["width"], info["height"]
-        half = 0.5 * info["n_cameras"] * width / info.get("magnification", 1.0)
+        half = 0.5 * info["n_cameras"] * width
         for gradient, radii in zip(gradients, info["radii"], strict=True):  # a camera's [N, 2], [N]
-            visible = radii > least
+            visible = radii > 0
             # With respect to coordinates that run over [-1, 1] across the image.
             norms = torch.hypot(gradient[:, 0], gradient[:, 1] * (height / width))
             state["grad2d"].add_(torch.where(visible, norms, 0.0), alpha=half)
@@ -75,9 +100,9 @@ class AdaptiveDensityControl(DefaultStrategy):
 
     @torch.no_grad()
     def _prune_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any], step: int):
-        """Remove what is transparent, too large or not finite, unless nothing would be left to go on with."""
+        """Remove what is transparent, too large or not finite, unless no Gaussian would be left."""
         if self.guarded:
-            bury_broken(params)
+            mark_for_removal(params)
             sizes = torch.exp(params["scales"]).amax(dim=-1)
             stays = torch.sigmoid(params["opacities"].flatten()) >= self.prune_opa
             if step > self.reset_every:
@@ -89,15 +114,15 @@ class AdaptiveDensityControl(DefaultStrategy):
 
 @dataclass
 class MarkovChainMonteCarlo(MCMCStrategy):
-    """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians move to living ones, up to a fixed number.
+    """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians are relocated to living ones, with a fixed cap.
 
-    Its schedule stands here again because of the last line of a step: gsplat's noise is fifteen launches.
+    The schedule is written anew because of the noise, which is fifteen launches in gsplat and two here.
     """
 
     absgrad: bool = False
     """MCMC reads no gradients of the centers; a field because the render call asks for it."""
     guarded: bool = True
-    """Relocate Gaussians that are not finite, and go on where nobody is alive; skipped steps perturb nothing."""
+    """Relocate Gaussians that are not finite, and revive a scene in which all are dead."""
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of the strategy; the scene's scale plays no part in it."""
@@ -120,16 +145,16 @@ class MarkovChainMonteCarlo(MCMCStrategy):
             self._add_new_gs(params, optimizers, binoms)
             torch.cuda.empty_cache()
         lr = optimizers["means"].param_groups[0]["lr"]
-        perturb(params, lr * self.noise_lr, info.get("skipped") if self.guarded else None)
+        perturb(params, lr * self.noise_lr, info.get("noise_scale"))
 
     @torch.no_grad()
     def _relocate_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], binoms: Tensor) -> int:
-        """Move the dead to the living. Where nobody lives, wake everybody: gsplat would draw from nothing and fail.
+        """Relocate dead Gaussians. Where all are dead, raise every opacity: gsplat would sample from nothing and fail.
 
-        A Gaussian of less than 1/255 is never drawn and gets no gradient, so a dead scene would stay dead.
+        A Gaussian below an opacity of 1/255 is never drawn and gets no gradient, so a dead scene would stay dead.
         """
         if self.guarded:
-            broken = bury_broken(params)
+            broken = mark_for_removal(params)
             opacities = params["opacities"]
             if not (torch.sigmoid(opacities) > self.min_opacity).any():
                 awake = math.log(2 * self.min_opacity / (1 - 2 * self.min_opacity))

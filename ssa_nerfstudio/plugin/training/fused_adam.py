@@ -1,4 +1,4 @@
-"""Adam in one kernel a parameter group, with little Python around it, and steps that the device can refuse."""
+"""Adam in one kernel per parameter group, with little Python around it, and steps that the device can skip."""
 
 from __future__ import annotations
 
@@ -21,50 +21,44 @@ class FusedAdamConfig(AdamOptimizerConfig):
 
 
 class FusedAdam(torch.optim.Adam):
-    """`torch.optim.Adam(fused=True)`, whose state it keeps to the letter.
+    """`torch.optim.Adam(fused=True)` with the same state.
 
-    A training of splats has seven optimizers of one or two parameters, and is bound by the host: what torch does around
-    the kernel (sorting by device and type, a dictionary of found_inf a call, undoing the step count of a refused step
-    with one more kernel) costs several times the kernel.
+    A training of splats has seven optimizers of one or two parameters and is bound by the host: what torch does around
+    the kernel (sorting by device and type, one more kernel to undo the count of a skipped step) costs several times the
+    kernel. Uses the private `torch._fused_adam_` and `torch._foreach_add_`; `compat.versions` checks torch's version.
     """
-
-    refused: Tensor | None = None
-    """One number on the device: where it is 1, a step changes nothing. None: every step is taken."""
 
     def __init__(self, params: Any, **settings: Any) -> None:
         super().__init__(params, fused=True, **settings)
 
-    def counters(self) -> list[Tensor]:
-        """The numbers of steps, on the device, of the parameters that have a gradient."""
-        return [self._of(p)["step"] for group in self.param_groups for p in group["params"] if p.grad is not None]
-
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Take a step with the gradients that there are, and count it.
+        """Count and take a step.
 
         Args:
             closure: not supported; as in torch for gradient scaling.
         """
         scale: Tensor | None = getattr(self, "grad_scale", None)
-        overflow: Tensor | None = getattr(self, "found_inf", None)  # both are a GradScaler's
-        refused = self.refused
-        if overflow is not None:
-            refused = overflow if refused is None else torch.maximum(overflow, refused)
-        count_steps(self.counters(), 1 if refused is None else 1 - refused)
-        self.update(refused, scale)
+        overflow: Tensor | None = getattr(self, "found_inf", None)  # both are set by a GradScaler
+        count_steps(self.counters(), 1 if overflow is None else 1 - overflow)
+        self.update(overflow, scale)
 
-    def update(self, refused: Tensor | None, scale: Tensor | None = None) -> None:
+    def counters(self) -> list[Tensor]:
+        """Numbers of steps, scalars on the device, of the parameters that have a gradient."""
+        return [self._state_of(p)["step"] for group in self.param_groups for p in group["params"] if p.grad is not None]
+
+    def update(self, skipped: Tensor | None, scale: Tensor | None = None) -> None:
         """Take a step that is counted already: `step` without torch's hooks and profiler marks. Under `no_grad`.
 
         Args:
-            refused: one number; where it is 1, nothing changes.
-            scale: one number by which the gradients are too large.
+            skipped: scalar; where it is 1, nothing changes.
+            scale: scalar by which the gradients are too large.
         """
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
             if not parameters:
                 continue
-            states = [self._of(p) for p in parameters]
+            states = [self._state_of(p) for p in parameters]
             torch._fused_adam_(  # pyright: ignore[reportPrivateImportUsage]
                 parameters,
                 [p.grad for p in parameters],
@@ -80,10 +74,10 @@ class FusedAdam(torch.optim.Adam):
                 amsgrad=False,
                 maximize=False,
                 grad_scale=scale,
-                found_inf=refused,
+                found_inf=skipped,
             )
 
-    def _of(self, parameter: Tensor) -> dict[str, Tensor]:
+    def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
         state = self.state[parameter]
         if not state:
             state["step"] = torch.zeros((), dtype=torch.float32, device=parameter.device)
@@ -92,11 +86,14 @@ class FusedAdam(torch.optim.Adam):
         return state
 
 
-def count_steps(counters: list[Tensor], more: float | Tensor = 1) -> None:
-    """Add to numbers of steps; in one kernel, and on the device where `more` [] is there.
+def count_steps(counters: list[Tensor], increment: float | Tensor = 1) -> None:
+    """Add to numbers of steps, in one kernel and without reading the device.
 
-    A list of it then, because torch would read a tensor without dimensions from the device to use it as a number.
+    Args:
+        counters: scalars.
+        increment: a number, or a scalar on the device.
     """
     if counters:
-        each = [more.reshape(())] * len(counters) if isinstance(more, Tensor) else more
+        # A list, because torch would read a tensor without dimensions from the device to use it as a number.
+        each = [increment.reshape(())] * len(counters) if isinstance(increment, Tensor) else increment
         torch._foreach_add_(counters, each)  # pyright: ignore[reportPrivateImportUsage]

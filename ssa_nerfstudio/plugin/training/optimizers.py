@@ -1,7 +1,8 @@
-"""All optimizers of a training at once: their steps counted in one kernel, and taken all together or not at all."""
+"""All optimizers of a training: their steps are counted in one kernel and taken together or not at all."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,17 +11,17 @@ from torch import Tensor
 from torch.nn import Parameter
 
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam, count_steps
-from ssa_nerfstudio.plugin.training.nonfinite import StepGuard
+from ssa_nerfstudio.plugin.training.nonfinite import NonFiniteGuard
 
 
 class JointOptimizers(Optimizers):
-    """nerfstudio's optimizers, with a guard that judges every step or none."""
+    """nerfstudio's optimizers with one verdict per step for all of them."""
 
     def __init__(
         self,
         config: dict[str, Any],
         param_groups: dict[str, list[Parameter]],
-        guard: StepGuard | None,
+        guard: NonFiniteGuard | None,
     ) -> None:
         """As nerfstudio's.
 
@@ -31,50 +32,49 @@ class JointOptimizers(Optimizers):
         """
         super().__init__(config, param_groups)
         self.guard = guard
-        self._counted: list[list[Tensor]] = []
-        """The numbers of steps that went up at every judged step since the last look."""
-        self._quick: set[str] = set()
-        """Groups of which nothing is asked but to step."""
-        for name, optimizer in self.optimizers.items():
-            if guard is not None:
-                guard.watch(optimizer)
-            if isinstance(optimizer, FusedAdam) and config[name]["optimizer"].max_norm is None:
-                self._quick.add(name)
-                # What torch's schedulers ask for before their first step; `update` goes round what would say it.
+        for optimizer in self.optimizers.values():
+            if isinstance(optimizer, FusedAdam):
+                # torch's schedulers warn unless `step` was called; `update` stands in for it.
                 optimizer._opt_called = True  # pyright: ignore[reportAttributeAccessIssue]
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
-        """Forget gradients; without what torch does around that for its profiler, a tenth of a millisecond in all."""
+        """Drop gradients, without the profiler marks of torch's `zero_grad` (a tenth of a millisecond in all)."""
         for name in param_groups:
             for group in self.optimizers[name].param_groups:
                 for parameter in group["params"]:
                     parameter.grad = None
 
-    def optimizer_scaler_step_some(self, grad_scaler: Any, param_groups: list[str]) -> None:
-        """Judge the step, and step the groups."""
-        optimizers = {name: self.optimizers[name] for name in param_groups}
-        refused = None if self.guard is None else self.guard.judge(self.optimizers)
-        others = [name for name in param_groups if grad_scaler.is_enabled() or name not in self._quick]
-        quick = [o for name, o in optimizers.items() if name not in others and isinstance(o, FusedAdam)]
-        with torch.no_grad():
-            counters = [counter for optimizer in quick for counter in optimizer.counters()]
-            count_steps(counters)
-            for optimizer in quick:
-                optimizer.update(refused)
-        if refused is not None:
-            self._counted.append(counters)
-        if others:
-            super().optimizer_scaler_step_some(grad_scaler, others)
+    def step_groups(self, groups: Sequence[str], loss: Tensor, grad_scaler: torch.amp.GradScaler) -> None:
+        """Judge a step and let the groups take it.
 
-    def look(self, step: int) -> None:
-        """Let the guard look, and take back the count of steps that it skipped.
-
-        Until here, at most `READ_EVERY` steps, Adam has taken them for steps. It then corrects both moments as it would
-        later on, so that its steps are longer: by a few percent after a few skipped ones, at most twice as long after
-        dozens at the beginning of a training. To count what the device decides would cost a kernel a step.
+        Args:
+            groups: names of the groups that step now; the others accumulate gradients.
+            loss: the step's loss [], unscaled.
+            grad_scaler: nerfstudio's, enabled under mixed precision. With a guard it only unscales: the guard's verdict
+                holds for all groups, the scaler's own would hold for one.
         """
-        if self.guard is None:
+        if self.guard is None and grad_scaler.is_enabled():
+            super().optimizer_scaler_step_some(grad_scaler, list(groups))
             return
-        counted, self._counted = self._counted, []
-        for at in self.guard.look(step):
-            count_steps(counted[at], -1)
+        optimizers = [self.optimizers[name] for name in groups if self._has_gradient(name)]
+        if grad_scaler.is_enabled():
+            for optimizer in optimizers:
+                grad_scaler.unscale_(optimizer)
+        verdict = None if self.guard is None else self.guard.judge(loss, self.optimizers)
+        for name in groups:
+            max_norm = self.config[name]["optimizer"].max_norm
+            if max_norm is not None:
+                torch.nn.utils.clip_grad_norm_(self.parameters[name], max_norm)
+        fused = [optimizer for optimizer in optimizers if isinstance(optimizer, FusedAdam)]
+        with torch.no_grad():
+            counters = [counter for optimizer in fused for counter in optimizer.counters()]
+            count_steps(counters, 1 if verdict is None else verdict.taken)
+            for optimizer in fused:
+                optimizer.update(None if verdict is None else verdict.skipped)
+        for optimizer in optimizers:
+            # Other optimizers cannot be told on the device: the host waits for the verdict.
+            if not isinstance(optimizer, FusedAdam) and (verdict is None or verdict.taken.item()):
+                optimizer.step()
+
+    def _has_gradient(self, name: str) -> bool:
+        return any(p.grad is not None for group in self.optimizers[name].param_groups for p in group["params"])

@@ -1,4 +1,4 @@
-"""FusedAdam is torch's Adam to the last bit, and a refused step leaves no trace."""
+"""FusedAdam is torch's Adam to the last bit, and a skipped step leaves no trace."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def test_it_is_torchs_to_the_last_bit(settings) -> None:
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
 
 
-def test_a_refused_step_changes_nothing_and_the_next_is_as_if_it_had_not_been() -> None:
+def test_a_skipped_step_changes_nothing_and_the_next_is_as_if_it_had_not_been() -> None:
     (ours, torchs), (optimizer, plain) = two()
     assert isinstance(optimizer, FusedAdam)
-    for value, refused in ((1.0, 0.0), (float("nan"), 1.0), (0.5, 0.0)):
+    for value, skipped in ((1.0, 0.0), (float("nan"), 1.0), (0.5, 0.0)):
         ours.grad = torch.full((3, 4), value)
-        optimizer.refused = torch.tensor(refused)
+        optimizer.found_inf = torch.tensor(skipped)  # pyright: ignore[reportAttributeAccessIssue]
         before = copy.deepcopy([ours.detach(), *optimizer.state[ours].values()])
         optimizer.step()
-        if refused:
+        if skipped:
             assert all(torch.equal(a, b) for a, b in zip(before, [ours, *optimizer.state[ours].values()], strict=True))
         else:
             torchs.grad = torch.full((3, 4), value)

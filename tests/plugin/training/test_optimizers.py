@@ -1,4 +1,4 @@
-"""All optimizers of a training at once: exact counts, and everything that nerfstudio's do."""
+"""All optimizers of a training: exact counts, and everything that nerfstudio's do."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
-from ssa_nerfstudio.plugin.training.nonfinite import StepGuard
+from ssa_nerfstudio.plugin.training.nonfinite import NonFiniteGuard
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 
+LOSS = torch.ones(())
 NO_SCALER = torch.amp.GradScaler("cpu", enabled=False)
 
 
-def joint(guard: StepGuard | None = None, max_norm: float | None = None) -> tuple[JointOptimizers, list]:
+def joint(guard: NonFiniteGuard | None = None, max_norm: float | None = None) -> tuple[JointOptimizers, list]:
     """Optimizers of two groups, a and b, of one parameter of three numbers each, and those."""
     parameters = [torch.nn.Parameter(torch.zeros(3)) for _ in range(2)]
     config = {
@@ -35,35 +36,28 @@ def counts(optimizers: JointOptimizers) -> list[float]:
     return [float(v["step"]) for o in optimizers.optimizers.values() for v in o.state.values()]
 
 
-def test_steps_are_counted_where_they_are_taken_and_nowhere_else(capsys):
+def test_steps_are_counted_where_they_are_taken_and_nowhere_else(caplog):
     """A rig: each camera's overlay has gradients at steps of its own; a skip belongs to the step it happened at."""
-    guard = StepGuard(limit=100, magnified=False)
+    guard = NonFiniteGuard(max_skipped_steps=100)
     optimizers, (a, b) = joint(guard)
     for step in range(12):
         optimizers.zero_grad_some(["a", "b"])
-        broken = step in (3, 5, 7)
+        assert a.grad is None
+        assert b.grad is None
         here = a if step % 2 else b
-        here.grad = torch.full((3,), math.nan if broken else 1.0)
-        optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
-    assert counts(optimizers) == [6, 6]
-    optimizers.look(11)
-    assert "3 of the 12 steps up to 11 were skipped" in capsys.readouterr().err
-    optimizers.zero_grad_some(["a", "b"])
-    a.grad = torch.full((3,), math.nan)  # another window; b was first in the one before
-    optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
-    optimizers.look(12)
+        here.grad = torch.full((3,), math.nan if step in (3, 5, 7) else 1.0)
+        optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
     assert counts(optimizers) == [3, 6]
+    assert guard.check(11) == 3
+    assert "3 of the 12 steps up to 11 were skipped" in caplog.text
     assert torch.isfinite(a).all()
-    optimizers.zero_grad_some(["a", "b"])
-    assert a.grad is None
-    assert b.grad is None
 
 
 @pytest.mark.parametrize("guarded", [True, False])
 def test_what_a_group_asks_of_its_gradients_is_done(guarded):
-    optimizers, (a, b) = joint(StepGuard(limit=100, magnified=False) if guarded else None, max_norm=0.5)
+    optimizers, (a, b) = joint(NonFiniteGuard(max_skipped_steps=100) if guarded else None, max_norm=0.5)
     a.grad, b.grad = torch.full((3,), 10.0), torch.full((3,), 0.1)
-    optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
+    optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
     assert a.grad.norm() == pytest.approx(0.5, rel=1e-4)
     assert counts(optimizers) == [1, 1]
     assert (a < 0).all()
@@ -75,7 +69,7 @@ def test_a_scaler_of_gradients_is_asked():
     for value in (1.0, math.inf):
         scaler.scale(torch.ones(()))  # makes its state on first use
         a.grad, b.grad = torch.full((3,), 4 * value), torch.full((3,), 4.0)
-        optimizers.optimizer_scaler_step_some(scaler, ["a", "b"])
+        optimizers.step_groups(["a", "b"], LOSS, scaler)
         scaler.update()
     assert counts(optimizers) == [1, 2]
     assert optimizers.optimizers["a"].state[a]["exp_avg"][0] == pytest.approx(0.1)
@@ -86,30 +80,24 @@ def test_schedulers_find_optimizers_that_have_stepped():
     a.grad, b.grad = torch.ones(3), torch.ones(3)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        optimizers.optimizer_scaler_step_some(NO_SCALER, ["a", "b"])
+        optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
         optimizers.scheduler_step_all(0)
     assert optimizers.optimizers["a"].param_groups[0]["lr"] < 0.1
 
 
-def test_a_look_with_nothing_judged_forgets_no_row_and_names_nothing_it_cannot_know(capsys):
-    guard = StepGuard(limit=20, magnified=False)
-    parameters = {name: torch.nn.Parameter(torch.zeros(2)) for name in "ab"}
-    plain = {name: torch.optim.Adam([parameter]) for name, parameter in parameters.items()}
-    for optimizer in plain.values():
-        guard.watch(optimizer)
+def test_a_check_with_nothing_judged_keeps_the_run_of_skips(caplog):
+    guard = NonFiniteGuard(max_skipped_steps=20)
+    optimizers, (a, b) = joint(guard)
     for _ in range(10):
-        parameters["a"].grad, parameters["b"].grad = torch.full((2,), math.nan), torch.ones(2)
-        guard.judge(plain)
-        for optimizer in plain.values():
-            optimizer.step()  # kept from its gradient
-    assert guard.look(9) == list(range(10))
-    assert "10 of the 10 steps up to 9 were skipped: the loss or a gradient was not finite" in capsys.readouterr().err
-    assert guard.look(9) == []
+        a.grad, b.grad = torch.full((3,), math.nan), torch.ones(3)
+        optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
+    assert guard.check(9) == 10
+    assert "10 of the 10 steps up to 9 were skipped: the gradient of a was not finite" in caplog.text
+    assert guard.check(9) == 0
     for _ in range(9):
-        parameters["a"].grad = torch.full((2,), math.nan)
-        guard.judge(plain)
-    assert guard.look(18) == list(range(9))
-    parameters["a"].grad = torch.full((2,), math.nan)
-    guard.judge(plain)
+        a.grad = torch.full((3,), math.nan)
+        optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
+    assert guard.check(18) == 9
+    optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
     with pytest.raises(TrainingError, match="from step 0 on, were skipped because the gradient of a was"):
-        guard.look(19)
+        guard.check(19)
