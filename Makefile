@@ -2,19 +2,21 @@
 #   make demo                  the built-in scene, about three minutes on two cores without a GPU
 #   make demo DATA=folder      the same comparison on your nerfstudio dataset
 #   make docs                  the documentation as a site, in site/
-#   make test, make lint       what .ci/run runs, with make docs
+#   make test, make lint       what .ci/run runs, with make docs and make bare
+#   make bare                  the product alone, without experiments, in an environment of its own (.venv-bare)
 #   make stability             every hard case, the long ones too (docs/stability.md)
 
 VENV := .venv
 READY := $(VENV)/.ready
 BIN := $(VENV)/bin
+BARE := .venv-bare
 # The first Python that nerfstudio 1.1.5 supports, found by running it: version managers' shims exist without working.
 PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' 2>/dev/null && echo $$p && break; done)
 DATA ?=
 DEMO_OPTIONS ?=
 
-.PHONY: setup demo docs test stability lint format clean
+.PHONY: setup demo docs test stability lint bare format clean
 
 setup: $(READY)
 
@@ -41,11 +43,20 @@ stability: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# Installs the wheel's requirements alone, and takes a capture from photos to exports with them.
+bare: $(READY)
+	$(BIN)/python tests/bare_install/make_capture.py $(BARE)/capture
+	test -x $(BARE)/bin/python || $(PYTHON) -m venv $(BARE)
+	PYTHONWARNINGS=ignore $(BARE)/bin/python -m pip install --quiet --upgrade pip .
+	$(BARE)/bin/python -m ssa_nerfstudio.plugin.compat.open3d_libraries
+	$(BARE)/bin/python tests/bare_install/check.py $(BARE)/capture
 
 format: $(READY)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 clean:
-	rm -rf $(VENV) outputs build site *.egg-info
+	rm -rf $(VENV) $(BARE) outputs build site *.egg-info

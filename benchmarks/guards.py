@@ -20,8 +20,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.runs.training_run import configure, versions
 from ssa_nerfstudio.plugin.trainer import SSATrainer
-from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam
-from ssa_nerfstudio.plugin.training.nonfinite import READ_EVERY
+from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY
 
 
 @dataclass
@@ -37,7 +36,7 @@ class Command:
     grow: int = 2_000
     """Steps of ordinary training before the first block."""
     pairs: int = 100
-    """So many times as many steps as lie between two looks of the host; the first two warm up."""
+    """So many times as many steps as lie between two checks by the host; the first two warm up."""
     block: int = 10
     """Steps before the other takes its turn."""
     scale_factor: float = 1.0
@@ -45,8 +44,8 @@ class Command:
 
     def run(self) -> None:
         """Train in turns and print one line."""
-        if READ_EVERY % self.block or self.pairs < 3:
-            raise InputError(f"--block must divide {READ_EVERY} and --pairs be at least 3")
+        if CHECK_EVERY % self.block or self.pairs < 3:
+            raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 3")
         with TemporaryDirectory() as folder:
             training = self._training(Path(folder))
             for _ in range(self.grow):
@@ -55,7 +54,7 @@ class Command:
         percent = 100 * (times[:, 1] / times[:, 0] - 1)
         draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
         low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
-        without = 1e3 * np.median(times[:, 0]) / READ_EVERY
+        without = 1e3 * np.median(times[:, 0]) / CHECK_EVERY
         gaussians = training.trainer.pipeline.model.num_points
         print(
             f"{self.method}, overlay {self.overlay}, {gaussians} Gaussians, {versions()['device']}: {without:.3f} ms a "
@@ -63,9 +62,9 @@ class Command:
         )
 
     def _pair(self, training: Training, pair: int) -> list[float]:
-        """Seconds of `READ_EVERY` steps without guards, and of the same with."""
+        """Seconds of `CHECK_EVERY` steps without guards, and of the same with."""
         laps: dict[bool, list[Lap]] = {False: [], True: []}
-        for block in range(READ_EVERY // self.block):
+        for block in range(CHECK_EVERY // self.block):
             begin = training.steps
             first = bool((pair + block) % 2)
             for guarded in (first, not first):
@@ -80,7 +79,7 @@ class Command:
 
     def _training(self, output: Path) -> Training:
         model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": self.grow, "mcmc_stop_at": self.grow}
-        steps = self.grow + self.pairs * READ_EVERY
+        steps = self.grow + self.pairs * CHECK_EVERY
         config = configure(self.method, self.data, output, steps, model, self.scale_factor)
         config.scale_schedules = False
         torch.manual_seed(0)
@@ -121,18 +120,13 @@ class Training:
     def __init__(self, trainer: SSATrainer) -> None:
         self.trainer, self.steps = trainer, 0
         self._guard = trainer.optimizers.guard
-        self._scalers = {True: trainer.grad_scaler, False: torch.amp.GradScaler(enabled=False)}
 
     def switch(self, guarded: bool) -> None:
         """Do as from the start with `guards` in the configuration."""
         trainer, model = self.trainer, self.trainer.pipeline.model
         trainer.optimizers.guard = self._guard if guarded else None
-        trainer.grad_scaler = self._scalers[guarded]
         model.config.guards = model.strategy.guarded = guarded
         model.info = {}
-        for optimizer in trainer.optimizers.optimizers.values():
-            if isinstance(optimizer, FusedAdam):
-                optimizer.refused = None
 
     def step(self) -> dict[str, torch.Tensor]:
         """Train one step, as nerfstudio's loop does: the terms of its loss."""

@@ -21,6 +21,8 @@ COMMANDS = {
     "tradeoff": "What accuracy costs in time: one knob at a time and a few together, with frontier and knee.",
 }
 """Name and one line of help of each command; its module holds a dataclass `Command` with a method `run`."""
+EXPERIMENTS = {"bench", "demo", "report", "simulate", "tradeoff"}
+"""Commands that need the extra `experiments`."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -56,7 +58,14 @@ def _run(name: str, options: list[str]) -> None:
     from ssa_nerfstudio.cli import arguments
 
     command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
-    arguments.read(command, options, f"ssa {name}", COMMANDS[name]).run()
+    try:
+        arguments.read(command, options, f"ssa {name}", COMMANDS[name]).run()
+    except ModuleNotFoundError as error:
+        if name not in EXPERIMENTS or (error.name or "").startswith("ssa_nerfstudio"):
+            raise
+        raise InputError(
+            f"ssa {name} needs the package {error.name}", "pip install 'ssa-nerfstudio[experiments]'"
+        ) from error
 
 
 def _usage() -> str:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts, Overlay
-from ssa_nerfstudio.plugin.compat.upstream import allow_checkpoint_scalars
+from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import allow_checkpoint_scalars
 from ssa_nerfstudio.plugin.training.checkpoints import damage, newest_first, step_of
 
 _MODEL = "_model."

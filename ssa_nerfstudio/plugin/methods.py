@@ -1,4 +1,4 @@
-"""The methods that `ns-train` lists: entry points, nothing else."""
+"""The methods that `ns-train` lists: nerfstudio's entry points."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
 from ssa_nerfstudio.plugin import command_entry
-from ssa_nerfstudio.plugin.compat import open3d_libraries, upstream
+from ssa_nerfstudio.plugin.compat import nerfstudio_repairs, open3d_libraries, versions
 from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipelineConfig
@@ -17,10 +17,10 @@ from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 
 # Every nerfstudio command imports this module through the entry points, before it loads or renders anything.
 command_entry.report_in_one_line()
+versions.check_versions()
 open3d_libraries.preload()
-upstream.allow_checkpoint_scalars()
-upstream.give_mcmc_a_cpu_body()
-upstream.bring_ffmpeg()
+nerfstudio_repairs.allow_checkpoint_scalars()
+nerfstudio_repairs.provide_ffmpeg()
 
 
 def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:

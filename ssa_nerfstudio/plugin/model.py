@@ -20,7 +20,7 @@ from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.compat.upstream import without_lpips
+from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_lpips
 from ssa_nerfstudio.plugin.evaluation import figures_of_step, figures_of_view, pictures_of_view
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training import nonfinite

@@ -15,6 +15,7 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from torch import Tensor
 from torch.nn import ParameterDict
 
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 from ssa_nerfstudio.plugin.training.nonfinite import mark_for_removal
@@ -38,6 +39,8 @@ def make_strategy(
     with torch.no_grad():
         params["opacities"].fill_(torch.tensor(settings.mcmc_opacity_start).logit())
         params["scales"].add_(torch.tensor(settings.mcmc_scale_start).log())
+    if not torch.cuda.is_available():
+        enable_mcmc_on_cpu()
     return MarkovChainMonteCarlo(
         cap_max=settings.cap_max,
         refine_start_iter=settings.warmup_length,

@@ -54,7 +54,7 @@ class JointOptimizers(Optimizers):
                 holds for all groups, the scaler's own would hold for one.
         """
         if self.guard is None and grad_scaler.is_enabled():
-            super().optimizer_scaler_step_some(grad_scaler, list(groups))
+            super().optimizer_scaler_step_some(grad_scaler, list(groups))  # pyright: ignore[reportArgumentType]
             return
         optimizers = [self.optimizers[name] for name in groups if self._has_gradient(name)]
         if grad_scaler.is_enabled():

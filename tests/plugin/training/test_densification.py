@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
-from ssa_nerfstudio.plugin.compat.upstream import relocated
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import relocated
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 

@@ -1,0 +1,75 @@
+"""Repairs of nerfstudio 1.1.5."""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+import torchmetrics.image.lpip
+from nerfstudio.utils import install_checks
+
+
+def allow_checkpoint_scalars() -> None:
+    """Let `torch.load` of torch >= 2.6 read nerfstudio's checkpoints, which hold numpy scalars of the schedulers.
+
+    Without it `ns-eval`, `ns-render`, `ns-export`, `ns-viewer` and resuming fail with "Weights only load failed".
+    May go when nerfstudio saves plain floats (https://github.com/nerfstudio-project/nerfstudio/issues/3683).
+    """
+    reconstruct = np.float64(0).__reduce__()[0]
+    allowed: list[Any] = [
+        reconstruct,
+        # numpy 2 renamed the module; checkpoints written under the other major version name it the other way.
+        (reconstruct, "numpy.core.multiarray.scalar"),
+        (reconstruct, "numpy._core.multiarray.scalar"),
+        np.dtype,
+        *{type(np.dtype(kind)) for kind in (np.float32, np.float64, np.int32, np.int64, np.bool_)},
+    ]
+    torch.serialization.add_safe_globals(allowed)
+
+
+def provide_ffmpeg() -> None:
+    """Let `ns-render` find the ffmpeg of `imageio-ffmpeg`; it demands one even where it writes images.
+
+    Looked for only when nerfstudio asks, and not where the system has one. May go when `ns-render` asks for it only
+    for videos.
+    """
+    check = install_checks.check_ffmpeg_installed
+
+    def check_ffmpeg_installed() -> None:
+        if shutil.which("ffmpeg") is None:
+            import imageio_ffmpeg
+
+            folder = tempfile.mkdtemp(prefix="ssa-ffmpeg-")
+            atexit.register(shutil.rmtree, folder, ignore_errors=True)
+            os.symlink(imageio_ffmpeg.get_ffmpeg_exe(), os.path.join(folder, "ffmpeg"))
+            os.environ["PATH"] = os.pathsep.join([folder, os.environ.get("PATH", "")])
+        check()
+
+    install_checks.check_ffmpeg_installed = check_ffmpeg_installed
+
+
+@contextlib.contextmanager
+def without_lpips() -> Iterator[None]:
+    """Build a splatfacto model without LPIPS, whose constructor downloads AlexNet's weights and fails offline.
+
+    The model is built in the main thread before a viewer exists, so that the patch meets no other thread. May go when
+    splatfacto builds its metrics only where it evaluates.
+    """
+    original = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity
+
+    class _NoLpips(torch.nn.Module):
+        def __init__(self, **_) -> None:
+            super().__init__()
+
+    torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = _NoLpips
+    try:
+        yield
+    finally:
+        torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = original

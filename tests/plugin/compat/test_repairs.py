@@ -1,0 +1,146 @@
+"""Each repair is needed by the upstream that is installed: a test that fails here says which repair may go."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+import logging
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import gsplat.strategy.ops
+import numpy as np
+import pytest
+import torch
+from gsplat.cuda import _wrapper
+from gsplat.strategy import DefaultStrategy
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from nerfstudio.engine.trainer import Trainer
+from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.utils import install_checks
+
+from ssa_nerfstudio.plugin.compat import gsplat_repairs, nerfstudio_repairs, open3d_libraries, versions
+
+
+def run(code: str) -> subprocess.CompletedProcess:
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("repaired", [False, True])
+def test_numpy_scalars_in_checkpoints_need_to_be_allowed(tmp_path, repaired):
+    path = tmp_path / "scalar.ckpt"
+    torch.save({"lr": np.float64(0.5)}, path)
+    repair = (
+        "from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import allow_checkpoint_scalars as a; a();" * repaired
+    )
+    done = run(f"import torch; {repair} print(torch.load({str(path)!r}, weights_only=True))")
+    assert (done.returncode == 0) == repaired, done.stderr
+    assert repaired or pickle.UnpicklingError.__name__ in done.stderr
+
+
+def test_splatfacto_builds_lpips_which_downloads_weights(monkeypatch):
+    import torchmetrics.image.lpip
+
+    class Built(Exception):
+        pass
+
+    def build(**_):
+        raise Built
+
+    monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", build)
+    source = inspect.getsource(SplatfactoModel.populate_modules)
+    assert "LearnedPerceptualImagePatchSimilarity" in source
+    with nerfstudio_repairs.without_lpips():
+        torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(normalize=True)
+    with pytest.raises(Built):
+        torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(normalize=True)
+
+
+def test_nerfstudio_exits_without_an_ffmpeg_and_finds_the_one_that_is_provided(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    plain = inspect.unwrap(install_checks.check_ffmpeg_installed)
+    monkeypatch.setattr(install_checks, "check_ffmpeg_installed", _original(plain))
+    with pytest.raises(SystemExit):
+        install_checks.check_ffmpeg_installed()
+    nerfstudio_repairs.provide_ffmpeg()
+    install_checks.check_ffmpeg_installed()
+
+
+def _original(check):
+    """nerfstudio's own function, whether or not the plugin has replaced it in this process."""
+    cells = {
+        name: cell.cell_contents for name, cell in zip(check.__code__.co_freevars, check.__closure__ or (), strict=True)
+    }
+    return cells.get("check", check)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="gsplat's kernels run on CUDA")
+def test_gsplats_relocation_needs_cuda_and_runs_on_a_cpu_when_repaired():
+    arguments = torch.rand(4), torch.rand(4, 3), torch.full((4,), 2), torch.ones(5, 5)
+    with pytest.raises(Exception):  # noqa: B017, PT011 - whatever a missing backend raises
+        _wrapper._make_lazy_cuda_func("compute_relocation")(*arguments, 5)
+    gsplat_repairs.enable_mcmc_on_cpu()
+    opacities, scales = gsplat.strategy.ops.compute_relocation(*arguments)
+    assert torch.isfinite(opacities).all()
+    assert scales.shape == (4, 3)
+
+
+def test_gsplat_resets_opacities_at_step_0():
+    params = torch.nn.ParameterDict({"opacities": torch.full((3,), 3.0)})
+    optimizers: dict[str, torch.optim.Optimizer] = {"opacities": torch.optim.Adam([params["opacities"]])}
+    strategy = DefaultStrategy()
+    strategy._update_state = lambda *_, **__: None  # pyright: ignore[reportAttributeAccessIssue]
+    strategy.step_post_backward(params, optimizers, {}, 0, {})
+    assert (torch.sigmoid(params["opacities"]) < 0.011).all()
+
+
+def test_splatfacto_still_replaces_parameters_when_it_loads_a_checkpoint():
+    assert "torch.nn.Parameter(torch.zeros(" in inspect.getsource(SplatfactoModel.load_state_dict)
+
+
+def test_splatfacto_still_moves_seed_colors_to_cuda():
+    assert ".cuda()" in inspect.getsource(SplatfactoModel.populate_modules)
+
+
+def test_nerfstudio_still_pins_the_memory_of_cached_photos():
+    assert "pin_memory()" in inspect.getsource(FullImageDatamanager._load_images)
+
+
+def test_nerfstudios_resumed_runs_still_train_all_steps_again():
+    assert "range(self._start_step, self._start_step + num_iterations)" in inspect.getsource(Trainer.train)
+
+
+def test_nerfstudio_still_writes_times_at_every_step():
+    source = inspect.getsource(Trainer.train)
+    assert "EventName.TRAIN_RAYS_PER_SEC" in source
+
+
+def test_open3d_still_links_to_a_libusb_that_it_does_not_bring():
+    spec = importlib.util.find_spec("open3d")
+    assert spec is not None
+    assert spec.origin is not None
+    folder = Path(spec.origin).parent
+    libraries = sorted(folder.rglob("*.so*"), key=lambda path: path.stat().st_size)
+    assert any(open3d_libraries.LIBUSB.encode() in path.read_bytes() for path in libraries if "usb" not in path.name)
+    # The copy that `make setup` puts there does not count.
+    assert {path.parent for path in folder.rglob("libusb*")} <= {folder}
+
+
+@pytest.mark.parametrize(("found", "warned"), [("2.5.1", True), ("2.6.0", False), ("2.15.0", True)])
+def test_other_versions_are_named_once(monkeypatch, caplog, found, warned):
+    monkeypatch.setattr(versions, "version", lambda name: found if name == "torch" else versions.WRITTEN_FOR[name][0])
+    versions.check_versions.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        versions.check_versions()
+        versions.check_versions()
+    assert (caplog.text.count(f"torch {found} is installed") == 1) == warned
+    assert len(caplog.records) == warned
+
+
+def test_the_versions_are_those_of_the_package_metadata():
+    stated = (Path(__file__).parents[3] / "pyproject.toml").read_text()
+    low, below = versions.WRITTEN_FOR["torch"]
+    assert f'"torch>={low},<{below}"' in stated
+    assert all(f'"{name}=={versions.WRITTEN_FOR[name][0]}"' in stated for name in ("nerfstudio", "gsplat"))
