@@ -15,6 +15,7 @@ from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
 from benchmarks.guards import Training
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin import overlay_setup as first_look
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
@@ -156,14 +157,10 @@ def test_auto_is_the_default_except_for_the_papers_protocol():
     assert settings == {"ssa-splatfacto": "auto", "ssa-splatfacto-mcmc": "auto", "ssa-splatfacto-paper": "on"}
 
 
-def test_resuming_without_an_overlay_cannot_force_one(
-    clean_scene, tmp_path, capsys, configure_training, train_and_evaluate
-):
+def test_resuming_without_an_overlay_cannot_force_one(clean_scene, tmp_path, configure_training, train_and_evaluate):
     config = configure_training("ssa-splatfacto", clean_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
     other = configure_training("ssa-splatfacto", clean_scene, tmp_path, 4, {"num_downscales": 0, "overlay": "on"})
     other.load_dir = path.parent / "nerfstudio_models"
-    with pytest.raises(SystemExit) as refused:
+    with pytest.raises(InputError, match=r"--pipeline\.model\.overlay auto"):
         train_and_evaluate(other)
-    assert refused.value.code == 2
-    assert "--pipeline.model.overlay auto" in capsys.readouterr().err

@@ -8,12 +8,14 @@ from typing import Any
 import torch
 from hard_cases import Case, Family
 
-import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 
 DENSIFICATION = Family("Densification")
 Params = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
+
+enable_mcmc_on_cpu()
 
 
 def gaussians(n: int) -> tuple[Params, Optimizers]:

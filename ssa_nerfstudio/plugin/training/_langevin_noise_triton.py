@@ -37,7 +37,7 @@ def _perturb(
     inside = i < n
     amplitude = rate
     if SCALED:
-        scale = tl.load(factor)
+        scale = tl.load(factor + 0 * i)
         inside = inside & (scale != 0)  # a scale of 0 changes nothing, whatever the Gaussian holds
         amplitude = rate * scale
     opacity = tl.sigmoid(tl.load(opacities + i, mask=inside, other=0.0))

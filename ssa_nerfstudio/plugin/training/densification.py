@@ -39,8 +39,6 @@ def make_strategy(
     with torch.no_grad():
         params["opacities"].fill_(torch.tensor(settings.mcmc_opacity_start).logit())
         params["scales"].add_(torch.tensor(settings.mcmc_scale_start).log())
-    if not torch.cuda.is_available():
-        enable_mcmc_on_cpu()
     return MarkovChainMonteCarlo(
         cap_max=settings.cap_max,
         refine_start_iter=settings.warmup_length,
@@ -126,6 +124,10 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     """MCMC reads no gradients of the centers; a field because the render call asks for it."""
     guarded: bool = True
     """Relocate Gaussians that are not finite, and revive a scene in which all are dead."""
+
+    def __post_init__(self) -> None:
+        if not torch.cuda.is_available():
+            enable_mcmc_on_cpu()
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of the strategy; the scene's scale plays no part in it."""

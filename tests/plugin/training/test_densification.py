@@ -14,12 +14,13 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
-from ssa_nerfstudio.plugin.compat.gsplat_repairs import relocated
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu, relocated
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 
 WIDTH, HEIGHT = 40, 30
+
+enable_mcmc_on_cpu()
 
 
 def gaussians(n: int, seed: int = 0) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Optimizer]]:
@@ -154,9 +155,10 @@ def test_mcmc_relocates_adds_and_perturbs_as_gsplats_does():
 
 INTERPRETED = """
 import torch
-import ssa_nerfstudio.plugin.methods  # the CPU body that gsplat lacks
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
+enable_mcmc_on_cpu()
 from gsplat.strategy.ops import inject_noise_to_position
-from ssa_nerfstudio.plugin.training._langevin_noise_triton import move
+from ssa_nerfstudio.plugin.training._langevin_noise_triton import perturb_means
 
 torch.manual_seed(0)
 for n in (1, 700):
@@ -171,12 +173,12 @@ for n in (1, 700):
     torch.manual_seed(1)
     normals = torch.randn(n, 3)
     rest = [params[name] for name in ("quats", "scales", "opacities")]
-    for skipped in (None, torch.zeros(())):
+    for scale in (None, torch.ones(())):
         means = params["means"].clone()
-        move(means, *rest, normals, 5.0, skipped)
+        perturb_means(means, *rest, normals, 5.0, scale)
         torch.testing.assert_close(means, expected["means"], rtol=1e-5, atol=1e-5)
     means = params["means"].clone()
-    move(means, *rest, torch.full_like(normals, torch.nan), 5.0, torch.ones(()))
+    perturb_means(means, *rest, torch.full_like(normals, torch.nan), 5.0, torch.zeros(()))
     assert torch.equal(means, params["means"])
 print("equal")
 """
@@ -187,18 +189,18 @@ def test_tritons_noise_is_gsplats_in_its_interpreter():
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
-@pytest.mark.parametrize("skipped", [None, 0.0, 1.0])
-def test_noise_on_a_gpu_is_gsplats(skipped):
+@pytest.mark.parametrize("scale", [None, 0.0, 1.0])
+def test_noise_on_a_gpu_is_gsplats(scale):
     params, _ = gaussians(5000)
     params["opacities"].data -= 4
     params["scales"].data += 2
     params = {name: p.data.cuda() for name, p in params.items()}
     expected = {name: p.clone() for name, p in params.items()}
-    if skipped != 1.0:
+    if scale != 0.0:
         torch.manual_seed(1)
         ops.inject_noise_to_position(expected, {}, {}, 5.0)  # pyright: ignore[reportArgumentType]
     torch.manual_seed(1)
-    perturb(params, 5.0, None if skipped is None else torch.tensor(skipped, device="cuda"))
+    perturb(params, 5.0, None if scale is None else torch.tensor(scale, device="cuda"))
     torch.testing.assert_close(params["means"], expected["means"], rtol=1e-5, atol=1e-5)
 
 
@@ -252,12 +254,12 @@ def test_pruning_leaves_a_scene_only_with_the_guard(guarded):
 
 def test_noise_is_left_out_of_a_skipped_step():
     moved = []
-    for skipped in (0.0, 1.0):
+    for taken in (1.0, 0.0):
         params, optimizers = gaussians(30)
         params["opacities"].data[:] = -6.0
         before = params["means"].detach().clone()
         strategy = MarkovChainMonteCarlo(refine_start_iter=100)
-        info = {"skipped": torch.tensor(skipped)}
+        info = {"noise_scale": torch.tensor(taken)}
         strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, info)
         moved.append((params["means"] - before).abs().max().item())
     assert moved[0] > 0

@@ -13,7 +13,6 @@ from nerfstudio.engine.optimizers import AdamOptimizerConfig
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import ssa_nerfstudio.plugin.methods  # noqa: F401 - installs the CPU bodies that gsplat lacks
 from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.trainer import SSATrainer
