@@ -18,7 +18,11 @@ else:
     tomllib = pytest.importorskip("tomli")
 
 ROOT = Path(__file__).parents[1]
-OPTIONAL = {"triton": "comes with torch for CUDA", "pillow_heif": "the extra heic"}
+OPTIONAL = {
+    "triton": "comes with torch for CUDA",
+    "pillow_heif": "the extra heic",
+    "pydantic_core": "comes with pydantic",
+}
 
 
 def canonical(name: str) -> str:

@@ -138,7 +138,7 @@ class Operations(TorchDispatchMode):
 
 @OVERLAYS
 @pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
-def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_path, overlay, method):
+def test_the_guard_never_waits_for_the_device_and_does_little(tiny_scene, tmp_path, overlay, method, make):
     """Between two checks: reading one number (`_local_scalar_dense`) would make the host wait at every step."""
     counts: dict[bool, Counter[str]] = {}
     for guards in (True, False):
@@ -268,7 +268,7 @@ def test_a_skipped_step_is_masked_out_of_the_densification():
 @pytest.mark.skipif(torch.cuda.is_available(), reason="gsplat adds gradients up in any order")
 @OVERLAYS
 @pytest.mark.parametrize("method", ["ssa-splatfacto", "ssa-splatfacto-mcmc"])
-def test_a_sound_training_is_the_same_to_the_last_bit_without_guards(tiny_scene, tmp_path, overlay, method):
+def test_a_sound_training_is_the_same_to_the_last_bit_without_guards(tiny_scene, tmp_path, overlay, method, make):
     states = {}
     for guards in (True, False):
         trainer = make(tiny_scene, tmp_path / str(guards), method=method, overlay=overlay, guards=guards)
@@ -308,7 +308,7 @@ def test_any_optimizer_skips_and_then_continues(kind, scaled):
 
 
 @pytest.mark.parametrize("asked", [True, False])
-def test_a_training_with_a_gradient_scaler_is_guarded(tiny_scene, tmp_path, asked):
+def test_a_training_with_a_gradient_scaler_is_guarded(tiny_scene, tmp_path, asked, make):
     trainer = make(tiny_scene, tmp_path, use_grad_scaler=asked)
     assert trainer.grad_scaler.is_enabled() == (asked and torch.cuda.is_available())
     spoil(trainer, {2})
@@ -318,7 +318,7 @@ def test_a_training_with_a_gradient_scaler_is_guarded(tiny_scene, tmp_path, aske
     assert first_nonfinite(states[3]) is None
 
 
-def test_gradients_have_their_true_size_after_every_step(tiny_scene, tmp_path):
+def test_gradients_have_their_true_size_after_every_step(tiny_scene, tmp_path, make):
     """Of a training with and without the guard: hooks, logs and callbacks see the same gradients."""
     gradients = {}
     for guards in (True, False):
@@ -335,7 +335,7 @@ def test_gradients_have_their_true_size_after_every_step(tiny_scene, tmp_path):
 
 @OVERLAYS
 @pytest.mark.parametrize("what", ["quats", "means", "loss", "large"])
-def test_where_gradients_accumulate_a_broken_step_is_skipped_by_all_groups(tiny_scene, tmp_path, overlay, what):
+def test_where_gradients_accumulate_a_broken_step_is_skipped_by_all_groups(tiny_scene, tmp_path, overlay, what, make):
     """Quaternions step every second time; at step 2 they only accumulate."""
     trainer = make(tiny_scene, tmp_path, overlay=overlay, gradient_accumulation_steps={"quats": 2})
     spoil(trainer, {2}, "quats" if what == "large" else what, 1e25 if what == "large" else math.nan)
@@ -369,7 +369,7 @@ def test_counts_are_right_after_a_window_of_skips_and_refinements(tiny_scene, tm
     assert steps == {100 - len(broken)}
 
 
-def test_a_checkpoint_between_two_checks_holds_the_steps_that_were_taken(tiny_scene, tmp_path):
+def test_a_checkpoint_between_two_checks_holds_the_steps_that_were_taken(tiny_scene, tmp_path, make):
     trainer = make(tiny_scene, tmp_path, steps=12)
     trainer.config.steps_per_save, trainer.config.save_only_latest_checkpoint = 7, False
     spoil(trainer, {3, 5, 10}, "scales")
@@ -408,7 +408,7 @@ def test_cameras_and_bilateral_grids_skip_with_the_rest(tiny_scene, tmp_path, gr
 
 
 @OVERLAYS
-def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny_scene, tmp_path, overlay):
+def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny_scene, tmp_path, overlay, make):
     trainer = make(tiny_scene, tmp_path, steps=110, overlay=overlay, max_skipped_steps=20, stop_split_at=1)
     spoil(trainer, range(40, 110), "opacities")
     with pytest.raises(TrainingError) as caught:
@@ -419,7 +419,7 @@ def test_training_stops_after_so_many_in_a_row_and_names_parameter_and_step(tiny
     assert "the gradient of opacities was not finite" in line
 
 
-def test_skipped_steps_that_are_not_in_a_row_are_reported(tiny_scene, tmp_path, caplog):
+def test_skipped_steps_that_are_not_in_a_row_are_reported(tiny_scene, tmp_path, caplog, make):
     trainer = make(tiny_scene, tmp_path, steps=200, max_skipped_steps=3, stop_split_at=1)
     spoil(trainer, set(range(0, 200, 3)) | set(range(2, 200, 3)), "quats")
     trainer.train()
@@ -477,7 +477,7 @@ def test_the_culprit_is_the_parameter_whose_value_broke():
 
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
-def test_log_scales_stay_in_range(tiny_scene, tmp_path, overlay, guards):
+def test_log_scales_stay_in_range(tiny_scene, tmp_path, overlay, guards, make):
     trainer = make(tiny_scene, tmp_path, steps=CLAMP_EVERY + 1, overlay=overlay, guards=guards)
     with torch.no_grad():
         trainer.pipeline.model.scales[0], trainer.pipeline.model.scales[1] = -40.0, 30.0
@@ -540,7 +540,7 @@ def test_a_matte_at_either_end_comes_back_and_without_the_range_it_does_not(sign
 
 @OVERLAYS
 @pytest.mark.parametrize("guards", [True, False])
-def test_the_cap_holds_in_a_training_and_a_given_overlay_has_none(tiny_scene, tmp_path, overlay, guards):
+def test_the_cap_holds_in_a_training_and_a_given_overlay_has_none(tiny_scene, tmp_path, overlay, guards, make):
     trainer = make(tiny_scene, tmp_path, steps=CLAMP_EVERY + 1, overlay=overlay, guards=guards)
     learned = trainer.pipeline.model.artifacts.learned()
     with torch.no_grad():
@@ -575,7 +575,7 @@ def test_start_points_inside_a_camera_are_left_out(tiny_scene, tmp_path, overlay
 
 
 @OVERLAYS
-def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tmp_path, overlay):
+def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tmp_path, overlay, make):
     trainer = make(tiny_scene, tmp_path, overlay=overlay)
     trainer.save_checkpoint(0)
     with torch.no_grad():
@@ -587,7 +587,7 @@ def test_no_checkpoint_with_values_that_are_not_finite_is_written(tiny_scene, tm
 
 @OVERLAYS
 @pytest.mark.parametrize("value", [math.nan, math.inf])
-def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, overlay, value):
+def test_nor_one_whose_moments_are_not(tiny_scene, tmp_path, overlay, value, make):
     trainer = make(tiny_scene, tmp_path, steps=2, overlay=overlay)
     trainer.train()
     means = trainer.optimizers.optimizers["means"]
