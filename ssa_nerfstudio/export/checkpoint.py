@@ -87,7 +87,7 @@ class Checkpoint:
                 "train it with ssa-splatfacto",
             )
         artifacts = Artifacts().eval()
-        artifacts.make_room(self.model, prefix, wanted=True)
+        artifacts.allocate(self.model, prefix, wanted=True)
         own = {name.removeprefix(prefix): v for name, v in self.model.items() if name.startswith(prefix)}
         artifacts.load_state_dict(own)
         return artifacts

@@ -1,4 +1,4 @@
-"""The artifacts of a capture inside the model: one overlay a camera group, and which camera shows which."""
+"""The overlays of a capture inside the model: one per camera group, and which camera shows which."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ Overlay = ScreenSpaceOverlay | OracleOverlay
 
 
 class Artifacts(nn.Module):
-    """Overlays by camera group. Empty until `put` is called or a checkpoint makes room for its own.
+    """Overlays by camera group; empty until `assign` or `allocate` is called.
 
-    A group in front of which nothing was found has none, and a checkpoint remembers that, too.
+    A group without an artifact has no overlay, which checkpoints record, too.
     """
 
     camera_keys: Tensor
-    """[G, 6], the cameras that have an overlay."""
+    """[G, 6], cameras of the groups with an overlay: width, height, fx, fy, cx, cy."""
     lenses: Tensor
-    """[G, LENS_VALUES], their raw cameras; empty where a checkpoint was written before they were kept."""
+    """[G, LENS_VALUES], their raw cameras; empty in checkpoints of the first version."""
     bare_keys: Tensor
-    """[B, 6], the cameras in front of which nothing was found."""
+    """[B, 6], cameras of the groups without an artifact."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -49,20 +49,20 @@ class Artifacts(nn.Module):
         assert isinstance(overlay, ScreenSpaceOverlay | OracleOverlay)
         return overlay
 
-    def put(
+    def assign(
         self,
         overlays: Sequence[ScreenSpaceOverlay | OracleOverlay | None],
         keys: Tensor,
         groups: list[int],
         lenses: Tensor,
     ) -> None:
-        """Put artifacts in front of the scene.
+        """Assign an overlay to each camera group.
 
         Args:
-            overlays: one a camera group; None where there is nothing in front.
-            keys: [G, 6], what the groups' cameras are (`camera_groups.group_cameras`).
+            overlays: one per camera group; None where there is no artifact.
+            keys: [G, 6], the groups' cameras (`camera_matching.group_cameras`).
             groups: each training view's group.
-            lenses: [G, LENS_VALUES], the groups' raw cameras (`camera_groups.describe_lenses`).
+            lenses: [G, LENS_VALUES], the groups' raw cameras (`camera_matching.describe_lenses`).
         """
         device = self.camera_keys.device
         covered = torch.tensor([overlay is not None for overlay in overlays], dtype=torch.bool)
@@ -75,25 +75,25 @@ class Artifacts(nn.Module):
 
     @property
     def exceed_white(self) -> bool:
-        """Whether what they add can bring a picture beyond white, where a photo clips."""
+        """Whether a composite can exceed 1, where a photo clips."""
         return any(isinstance(overlay, OracleOverlay) or overlay.adds_light for overlay in self.overlays)
 
     def learned(self) -> list[ScreenSpaceOverlay]:
-        """The overlays that have parameters."""
+        """The overlays with parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
 
     def of_view(self, view: int) -> Overlay | None:
-        """What is in front of a training view; None: nothing."""
+        """The overlay of a training view; None where it has none."""
         group = self._group_of_view[view]
         return None if group is None else self[group]
 
     def layers_of_camera(
         self, camera: Cameras, width: int, height: int, group: int | None = None
     ) -> tuple[Tensor, Tensor] | None:
-        """Transmittance and added light in front of any camera, or None where nothing is.
+        """Transmittance and addition of any camera, or None where it has no overlay.
 
-        A camera with the frame of a group shows that group's; a free viewpoint the one of its aspect, or the first;
-        unless a group is named.
+        A camera with the frame of a group shows that group's overlay. A free viewpoint shows the one of its aspect, or
+        the first. `group` overrides both.
         """
         if group is None:
             group = match_camera(camera, self._keys + self._bare)
@@ -102,30 +102,33 @@ class Artifacts(nn.Module):
         return letterboxed_layers(self[group], height, width) if group < len(self) else None
 
     @torch.no_grad()
-    def covered(self, group: int) -> tuple[Tensor, Tensor]:
-        """Fraction of the frame with a matte above one half, and the mean matte, both on the device."""
+    def coverage(self, group: int) -> tuple[Tensor, Tensor]:
+        """Fraction of the frame with a matte above one half, and the mean matte: scalars on the device."""
         _, alpha = straight_color(*self[group].layers())
         return (alpha > 0.5).float().mean(), alpha.mean()
 
-    def figures(self, group: int) -> str:
-        """`covered` in words."""
-        fraction, mean = (float(value) for value in self.covered(group))
+    def summary(self, group: int) -> str:
+        """`coverage` as a phrase."""
+        fraction, mean = (float(value) for value in self.coverage(group))
         overlay = self[group]
         light = isinstance(overlay, ScreenSpaceOverlay) and overlay.adds_light
         covered = "hidden or lit" if light else "hidden"
         return f"{fraction:.1%} of the frame more than half {covered}, mean matte {mean:.3f}"
 
-    def make_room(self, state: dict[str, Any], prefix: str, wanted: bool) -> None:
-        """Take the shapes of a checkpoint's overlays, or refuse one that does not fit those that are being trained.
+    def allocate(self, state: dict[str, Any], prefix: str, wanted: bool) -> None:
+        """Allocate overlays of a checkpoint's shapes, or check that they fit those that are being trained.
 
         Args:
-            state: the model's state dict; what an older version left out is added.
-            prefix: under which this module's entries stand in it.
-            wanted: False where an artifact must not appear: the run was asked to train without one.
+            state: the model's state dict; entries that older versions lack are added.
+            prefix: of this module's entries in it.
+            wanted: False where the run was asked to train without an overlay.
+
+        Raises:
+            InputError: the checkpoint's overlays do not fit this run.
         """
         count = len(state.get(f"{prefix}camera_keys", ()))
         for overlay in (f"{prefix}overlays.{g}." for g in range(count)):
-            if len(state[f"{overlay}frame"]) == 3:  # checkpoints of when no artifact added light
+            if len(state[f"{overlay}frame"]) == 3:  # checkpoints from before additive light
                 state[f"{overlay}frame"] = F.pad(state[f"{overlay}frame"], (0, 1))
                 if f"{overlay}evidence" in state:
                     state[f"{overlay}near"] = torch.ones_like(state[f"{overlay}evidence"])
@@ -154,18 +157,18 @@ class Artifacts(nn.Module):
         for name in ("camera_keys", "lenses", "bare_keys"):
             setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))
 
-    def take_over(self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str) -> None:
-        """Make room for the overlays of a checkpoint that is resumed, in front of the views that it had them in.
+    def resume_from(self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str) -> None:
+        """Allocate the overlays of a checkpoint that is resumed, and assign them to this run's views.
 
         Args:
-            state, prefix: as for `make_room`.
-            keys, groups: of this run's training cameras, as for `put`.
+            state, prefix: as for `allocate`.
+            keys, groups: of this run's training cameras, as for `assign`.
             setting: this run's overlay: auto, on or given.
 
         Raises:
             InputError: the checkpoint knows no camera like one of this run's, or was trained with another setting.
         """
-        self.make_room(state, prefix, wanted=True)
+        self.allocate(state, prefix, wanted=True)
         here = "given" if len(self) and isinstance(self[0], OracleOverlay) else "on" if len(self) else "off"
         if setting not in ("auto", here):
             raise InputError(

@@ -1,4 +1,4 @@
-"""nerfstudio's cameras and the artifact groups they belong to (`overlay.camera_groups`)."""
+"""nerfstudio's cameras and the camera groups they belong to (`cameras.groups`)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LENS_VALUES = 13
 
 
 def group_cameras(cameras: Cameras) -> tuple[Tensor, list[int]]:
-    """Sort cameras into groups that each get an overlay of their own, in order of first appearance.
+    """Sort cameras into groups with an overlay each, in order of first appearance.
 
     Returns:
         keys [G, 6] float64 (width, height, fx, fy, cx, cy of each group's first camera), and each camera's group.

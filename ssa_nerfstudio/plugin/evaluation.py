@@ -1,4 +1,4 @@
-"""What is logged of a render beside its photo: figures of a training step, figures and pictures of a test view."""
+"""What is logged of a render: metrics of a training step, metrics and images of a test view."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ from ssa_nerfstudio.plugin.artifacts import Artifacts
 
 
 @torch.no_grad()
-def figures_of_step(outputs: Mapping[str, Tensor], target: Tensor, artifacts: Artifacts) -> dict[str, Tensor]:
-    """On the device, for the log of a training that may hold anything.
+def step_metrics(outputs: Mapping[str, Tensor], target: Tensor, artifacts: Artifacts) -> dict[str, Tensor]:
+    """Metrics of a training step, unchecked and on the device.
 
     Args:
         outputs: the model's.
         target: the photo [H, W, 3] in [0, 1].
-        artifacts: what is in front of the cameras.
+        artifacts: the model's overlays.
 
     Returns:
-        psnr (dB) of the clean render, composite_psnr of what the photo shows, and of each artifact the fraction of the
-        frame with a matte above one half, and the mean matte.
+        psnr (dB) of the clean render, composite_psnr of the composite, and per overlay the fraction of the frame with a
+        matte above one half and the mean matte.
     """
     values = {"psnr": _psnr(outputs["rgb"], target)}
     if "composite" in outputs:
         values["composite_psnr"] = _psnr(outputs["composite"], target)
     for group in range(len(artifacts)):
         suffix = f"_{group}" if len(artifacts) > 1 else ""
-        values["overlay_covered" + suffix], values["overlay_matte" + suffix] = artifacts.covered(group)
+        values["overlay_covered" + suffix], values["overlay_matte" + suffix] = artifacts.coverage(group)
     return values
 
 
-def figures_of_view(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, float]:
-    """Of the clean render: psnr (dB), ssim ("valid" padding), mean_color_deviation, flip; and composite_psnr.
+def view_metrics(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, float]:
+    """Metrics of the clean render: psnr (dB), ssim ("valid" padding), mean_color_deviation, flip; and composite_psnr.
 
     Args:
         outputs: the model's.
         target: the photo [H, W, 3] in [0, 1].
     """
-    return {**figures_but_flip(outputs, target), "flip": metrics.flip(outputs["rgb"], target)}
+    return {**view_metrics_without_flip(outputs, target), "flip": metrics.flip(outputs["rgb"], target)}
 
 
-def figures_but_flip(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, float]:
-    """`figures_of_view` without the one that takes longer than all the others on a GPU."""
+def view_metrics_without_flip(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, float]:
+    """`view_metrics` without FLIP, which takes longer than all the others on a GPU."""
     render = outputs["rgb"]
     values = {
         "psnr": metrics.psnr(render, target),
@@ -57,8 +57,8 @@ def figures_but_flip(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str,
     return values
 
 
-def pictures_of_view(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, Tensor]:
-    """Photo beside render; and where there is an artifact, render beside composite, overlay beside matte.
+def view_images(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, Tensor]:
+    """Photo beside render; with an overlay also render beside composite and overlay beside matte.
 
     Args:
         outputs: the model's.

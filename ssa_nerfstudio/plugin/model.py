@@ -1,4 +1,4 @@
-"""splatfacto with an artifact in front: the wiring of overlay, rasterizer, densification and losses."""
+"""splatfacto with an overlay: wires overlay, rasterizer, densification and losses."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_lpips
-from ssa_nerfstudio.plugin.evaluation import figures_of_step, figures_of_view, pictures_of_view
+from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_metrics
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.seed_points import MIN_DISTANCE, color_parameters, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
-from ssa_nerfstudio.plugin.viewer import ArtifactControls, in_viewer
+from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
 from ssa_nerfstudio.rasterization import rasterizer
 
 _LOG = logging.getLogger(__name__)
@@ -50,10 +50,10 @@ class SSASplatfactoModel(SplatfactoModel):
     strategy: AdaptiveDensityControl | MarkovChainMonteCarlo
 
     def populate_modules(self) -> None:
-        """Build splatfacto's Gaussians without CUDA and without downloads, then what is ours."""
+        """Build splatfacto's Gaussians without CUDA and without downloads, then overlays and strategy."""
         points = self.seed_points = nonfinite.finite_points(self.seed_points)
         if points is not None:
-            # Upstream moves seed colors to CUDA (splatfacto.py:261); given none, it starts from random ones.
+            # Upstream moves seed colors to CUDA (splatfacto.py:261); without any it starts from random ones.
             self.seed_points = (points[0], points[1][:0])
         with without_lpips():
             super().populate_modules()
@@ -75,11 +75,11 @@ class SSASplatfactoModel(SplatfactoModel):
 
     @property
     def overlay(self) -> ArtifactControls | None:
-        """The viewer's elements, under the name of their folder; None where there is no artifact to look at."""
+        """The viewer's elements, under the name of their folder; None without an overlay."""
         return self._controls if len(self.artifacts) else None
 
     def set_scene_extent(self, extent: float) -> None:
-        """Tell the radius of the cameras' positions (world units), for `scale_by_extent`."""
+        """Set the radius of the cameras' positions (world units), used by `scale_by_extent`."""
         if self.config.scale_by_extent:
             self.scene_scale = extent
             self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
@@ -89,13 +89,13 @@ class SSASplatfactoModel(SplatfactoModel):
         return super().k_nearest_sklearn(x, min(k, len(x) - 1))
 
     def start_outside_cameras(self, positions: Tensor) -> None:
-        """Leave out start points that are inside a camera at positions [V, 3]. Before the optimizers are built."""
+        """Drop seed points inside a camera at positions [V, 3]; call it before the optimizers are built."""
         outside = outside_cameras(self.means.data, positions)
         if not self.config.guards or outside.all():
             return
         if not outside.any():
             _LOG.warning(
-                f"every start point is within {MIN_DISTANCE} of a camera, nearer than any is drawn: the scene "
+                f"every seed point is within {MIN_DISTANCE} of a camera, nearer than any is drawn: the scene "
                 "is too small; leave --pipeline.datamanager.dataparser.auto-scale-poses True"
             )
             return
@@ -110,7 +110,7 @@ class SSASplatfactoModel(SplatfactoModel):
             overlay.hold_far_pixels(waiting)
 
     def step_post_backward(self, step: int) -> None:
-        """After the optimizers' step: bring parameters back into their range, then densify."""
+        """After the optimizers' step: restore held pixels, clamp parameters, then densify."""
         for overlay in self.artifacts.learned():
             overlay.restore_held()
         if self.config.guards and step % nonfinite.CLAMP_EVERY == 0:
@@ -122,14 +122,14 @@ class SSASplatfactoModel(SplatfactoModel):
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.
 
-        Parameter objects stay what they are: the optimizers that hold them were built before. (splatfacto replaces
-        them, splatfacto.py:392, and a resumed run then trains nothing.)
+        Parameter objects are kept, because the optimizers hold them already. (splatfacto replaces them,
+        splatfacto.py:392, and a resumed run then trains nothing.)
         """
         self.step = 30000
         n = dict["gauss_params.means"].shape[0]
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
-        self.artifacts.make_room(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
+        self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
@@ -145,15 +145,15 @@ class SSASplatfactoModel(SplatfactoModel):
 
         Returns:
             rgb [H, W, 3]: the clean scene; accumulation [H, W, 1]; depth [H, W, 1] (not while training);
-            background [3], outside training [H, W, 3]; and, where there is an artifact: composite [H, W, 3],
-            the picture that a photo shows, overlay_rgb [H, W, 3] and overlay_alpha [H, W, 1].
+            background [3], outside training [H, W, 3]; and with an overlay: composite [H, W, 3], the prediction of the
+            photo, overlay_rgb [H, W, 3] and overlay_alpha [H, W, 1].
         """
         reduction = self._get_downscale_factor()
         width, height = frame(camera)
         drawn = self._render(camera, width // reduction, height // reduction, reduction)
         if not len(self.artifacts):
             return drawn
-        if in_viewer():
+        if is_viewer_frame():
             return self._controls.outputs(drawn, camera, width, height)
         if self.training:
             overlay = self.artifacts.of_view(metadata(camera)["cam_idx"])
@@ -207,8 +207,8 @@ class SSASplatfactoModel(SplatfactoModel):
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
         background = self._get_background_color()
-        # Views whose gradient is a view: an index or a slice fills a frame with zeros first. Hence hardtanh, too, whose
-        # gradient is one kernel; clamp's are five.
+        # squeeze, because the gradient of an index or a slice fills a frame with zeros first; hardtanh, because its
+        # gradient is one kernel and clamp's are five.
         accumulation, color = alpha.squeeze(0), render.squeeze(0)
         if with_depth:
             color = color[..., :3]
@@ -235,11 +235,11 @@ class SSASplatfactoModel(SplatfactoModel):
         return view_matrix(self.camera_optimizer.apply_to_camera(camera))
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """A photo in [0, 1]: as upstream's, to the last bit, in one pass over 8 bits instead of two."""
+        """Convert a photo to [0, 1] with upstream's result to the last bit, in one pass over uint8 instead of two."""
         return super().get_gt_img(torch.div(image, 255.0) if image.dtype == torch.uint8 else image)
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
-        """The paper's loss: photometric on what the photo shows, sparsity of the matte, the strategy's own terms."""
+        """The paper's loss: photometric on the composite, sparsity of the matte, and the strategy's own terms."""
         target = self.target(outputs, batch)
         shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
         if "mask" in batch:
@@ -265,28 +265,27 @@ class SSASplatfactoModel(SplatfactoModel):
         return losses
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
-        """PSNR against the photo, of the clean render and of the composite, and the number of Gaussians.
+        """PSNR of the clean render and of the composite against the photo, and the number of Gaussians.
 
-        While training only at the steps that are logged: at the others nobody would read them.
+        During training only at the steps that are logged.
         """
         if self.training and self.step % self.metrics_every:
             return {}
         target = self.target(outputs, batch)
-        values = {"gaussian_count": self.num_points, **figures_of_step(outputs, target, self.artifacts)}
+        values = {"gaussian_count": self.num_points, **step_metrics(outputs, target, self.artifacts)}
         self.camera_optimizer.get_metrics_dict(values)
         return values
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, Tensor], batch: dict[str, Tensor]
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
-        """Compare one test view with the clean render: psnr (dB), ssim ("valid" padding), flip, mean color deviation.
+        """Compare the clean render with a test photo: psnr (dB), ssim ("valid" padding), flip, mean color deviation.
 
-        `composite_psnr` compares what the photo shows with the photo: the figure to read where test photos carry the
-        artifact too.
+        `composite_psnr` compares the composite: the metric to read where test photos carry the artifact, too.
         """
         target = self.target(outputs, batch)
-        return figures_of_view(outputs, target), pictures_of_view(outputs, target)
+        return view_metrics(outputs, target), view_images(outputs, target)
 
     def target(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-        """The photo [H, W, 3] in [0, 1] that a render has to match: over its background where it is transparent."""
+        """The photo [H, W, 3] in [0, 1], composited over the render's background where it is transparent."""
         return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])

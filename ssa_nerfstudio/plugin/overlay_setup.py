@@ -1,4 +1,4 @@
-"""A first look at the photos, before anything is trained: what is in front of each camera, and how it starts."""
+"""Detects artifacts and initializes overlays before training."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ssa_nerfstudio.plugin.settings import ModelSettings
 def learned_overlays(
     config: ModelSettings, photos: list[dict[str, Any]], groups: list[int], sizes: list[tuple[int, int]]
 ) -> list[ScreenSpaceOverlay | None]:
-    """An overlay for each camera group; under overlay "auto" None where detection finds nothing.
+    """Make an overlay for each camera group; under overlay "auto" None where no artifact is detected.
 
     Args:
         config: the model's; overlay "auto" or "on".
@@ -31,27 +31,38 @@ def learned_overlays(
     """
     overlays: list[ScreenSpaceOverlay | None] = []
     for group, size in enumerate(sizes):
-        overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, config.overlay_light == "on")
-        if config.overlay == "auto" or config.overlay_start != "constant":
-            name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
-            statistics = _look_at([photo for photo, at in zip(photos, groups, strict=True) if at == group], name)
-            detection = detect(statistics) if config.overlay == "auto" else None
-            if detection is not None and not _found(detection, name):
-                overlays.append(None)
-                continue
-            if config.overlay_start == "detected":
-                area = static_area(statistics) if detection is None else detection.area
-                light = area.adds_light if config.overlay_light == "auto" else config.overlay_light == "on"
-                overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, light)
-                initialize(overlay, statistics, area)
-            elif config.overlay_start == "statistics":
-                initialize(overlay, statistics)
-        overlays.append(overlay)
+        name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
+        views = [photo for photo, at in zip(photos, groups, strict=True) if at == group]
+        overlays.append(_learned_overlay(config, views, size, name))
     return overlays
 
 
+def _learned_overlay(
+    config: ModelSettings, photos: list[dict[str, Any]], size: tuple[int, int], name: str
+) -> ScreenSpaceOverlay | None:
+    adds_light = config.overlay_light == "on"
+    if config.overlay == "on" and config.overlay_start == "constant":
+        return ScreenSpaceOverlay(*size, config.overlay_downscale, adds_light)
+    statistics = _statistics(photos, name)
+    area = None
+    if config.overlay == "auto":
+        detection = detect(statistics)
+        _report(detection, name)
+        if detection.verdict == "none":
+            return None
+        area = detection.area
+    if config.overlay_start == "detected":
+        area = static_area(statistics) if area is None else area
+        if config.overlay_light == "auto":
+            adds_light = area.adds_light
+    overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, adds_light)
+    if config.overlay_start != "constant":
+        initialize(overlay, statistics, area if config.overlay_start == "detected" else None)
+    return overlay
+
+
 def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[OracleOverlay]:
-    """The true layers of every camera group from an .npz file.
+    """Read the oracle overlay of every camera group from an .npz file.
 
     Raises:
         InputError: it holds none, or layers of other sizes.
@@ -76,23 +87,23 @@ def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[Orac
     return overlays
 
 
-def _look_at(photos: list[dict[str, Any]], name: str) -> ImageStatistics:
+def _statistics(photos: list[dict[str, Any]], name: str) -> ImageStatistics:
     views = ((photo["image"], photo.get("mask")) for photo in photos)
-    return accumulate(track(views, f"Looking at {name}", total=len(photos), transient=True))
+    return accumulate(track(views, f"Statistics of {name}", total=len(photos), transient=True))
 
 
-def _found(detection: Detection, name: str) -> bool:
-    """Say in one line what was found, and how to have it otherwise."""
+def _report(detection: Detection, name: str) -> None:
+    """Print the verdict in one line, with the option that overrides it."""
+    name = name[0].upper() + name[1:]
     if detection.verdict != "none":
         CONSOLE.print(
-            f"{name[0].upper()}{name[1:]} have a static artifact in front ({detection.verdict}, "
-            f"{detection.coverage:.1%} of the frame): it is learned. (--pipeline.model.overlay off: it is not.)"
+            f"{name} have a static artifact ({detection.verdict}, {detection.coverage:.1%} of the frame): training "
+            "with an overlay. (--pipeline.model.overlay off trains without.)"
         )
-        return True
+        return
     reason = "too few to tell" if detection.views < LEAST_VIEWS else f"p = {detection.p_value:.2g}"
     reason += ", too few static edges to report" if detection.slight else ""
     CONSOLE.print(
-        f"{name[0].upper()}{name[1:]} show no static artifact ({detection.views} views, {reason}): training without an "
-        "overlay. (--pipeline.model.overlay on: with one.)"
+        f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
+        "(--pipeline.model.overlay on trains with one.)"
     )
-    return False

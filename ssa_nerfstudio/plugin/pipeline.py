@@ -1,4 +1,4 @@
-"""Before training: look at the photos, and put an artifact in front of the model. After: nothing of its own."""
+"""Validates the input and assigns overlays to the model before training; otherwise nerfstudio's pipeline."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ssa_nerfstudio.plugin.camera_matching import describe_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import given_overlays, learned_overlays
-from ssa_nerfstudio.plugin.training.checkpoints import saved_pipeline
+from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.validation import check_device, check_settings, check_views
 
 
@@ -31,12 +31,11 @@ class SSAPipelineConfig(VanillaPipelineConfig):
     model: SSASplatfactoModelConfig = field(default_factory=SSASplatfactoModelConfig)
     """The scene and the artifact."""
     artifacts_of: Path | None = None
-    """A checkpoint whose overlays, or lack of them, are taken over instead of looking at the photos. The trainer sets
-    it when it resumes."""
+    """A checkpoint whose overlays, or lack of them, replace detection. The trainer sets it when it resumes."""
 
 
 class SSAPipeline(VanillaPipeline):
-    """`VanillaPipeline` whose model has its overlays before the optimizers are built, which is right after this."""
+    """`VanillaPipeline` whose model has its overlays before the optimizers are built."""
 
     config: SSAPipelineConfig
     datamanager: SSADatamanager
@@ -68,24 +67,24 @@ class SSAPipeline(VanillaPipeline):
 
     def _set_overlays(self) -> None:
         setting = self.config.model.overlay
-        resumed = saved_pipeline(self.config.artifacts_of) if self.config.artifacts_of else None
+        resumed = load_pipeline_state(self.config.artifacts_of) if self.config.artifacts_of else None
         if setting == "off" or (resumed is None and self.config.artifacts_of):
-            return  # what is wrong with the checkpoint, loading it will tell
+            return  # loading the checkpoint will say what is wrong with it
         lenses = describe_lenses(self.datamanager.train_dataset.cameras)
-        # Undistorts and crops the photos and rewrites the cameras: the overlay lives in what comes out.
+        # Undistorts and crops the photos and rewrites the cameras: overlays are in undistorted pixels.
         photos = self.datamanager.cached_train
         keys, groups = group_cameras(self.datamanager.train_dataset.cameras)
         sizes = [(int(key[1]), int(key[0])) for key in keys]
         artifacts = self.model.artifacts
         if resumed is not None:
-            artifacts.take_over(resumed, "_model.artifacts.", keys, groups, setting)
+            artifacts.resume_from(resumed, "_model.artifacts.", keys, groups, setting)
             return
         if setting == "given":
             overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
             overlays = learned_overlays(self.config.model, photos, groups, sizes)
         first = [groups.index(g) for g in range(len(keys))]
-        artifacts.put(overlays, keys, groups, lenses[first])
+        artifacts.assign(overlays, keys, groups, lenses[first])
 
 
 def _source(config: SSAPipelineConfig) -> Path:

@@ -1,4 +1,4 @@
-"""nerfstudio's trainer with schedules that fit the run, and resuming that finishes the run it resumes."""
+"""nerfstudio's trainer with scaled schedules, guarded steps, whole checkpoints, and resuming up to the planned step."""
 
 from __future__ import annotations
 
@@ -18,8 +18,14 @@ from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
-from ssa_nerfstudio.plugin.training.checkpoints import damage, newest_first, saved_pipeline, step_of, written_whole
-from ssa_nerfstudio.plugin.training.event_writers import spare_event_writers
+from ssa_nerfstudio.plugin.training.checkpoints import (
+    atomic_checkpoints,
+    damage,
+    load_pipeline_state,
+    newest_first,
+    step_of,
+)
+from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.training.schedules import scaled
@@ -34,10 +40,9 @@ class SSATrainerConfig(TrainerConfig):
 
     _target: type = field(default_factory=lambda: SSATrainer)
     pipeline: SSAPipelineConfig = field(default_factory=SSAPipelineConfig)
-    """Photos, cameras, scene and artifact."""
+    """Photos, cameras, scene and overlay."""
     scale_schedules: bool = True
-    """Scale every schedule by max_num_iterations / 30000, so that a shorter run is the whole run made shorter and not
-    its beginning."""
+    """Scale every schedule by max_num_iterations / 30000, so that a shorter run is a complete run."""
 
 
 class SSATrainer(Trainer):
@@ -54,7 +59,7 @@ class SSATrainer(Trainer):
         super().__init__(config, local_rank, world_size)
 
     def _resumed_checkpoint(self) -> Path | None:
-        """The checkpoint to resume from: without --load-step the newest that is whole."""
+        """The checkpoint to resume from; without --load-step the newest intact one."""
         folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
         check_checkpoint(folder, step, file)
         if folder is None:
@@ -62,7 +67,7 @@ class SSATrainer(Trainer):
         if step is not None:
             return folder / f"step-{step:09d}.ckpt"
         candidates = newest_first(folder)
-        usable = (path for path in candidates if damage(path) is None and saved_pipeline(path) is not None)
+        usable = (path for path in candidates if damage(path) is None and load_pipeline_state(path) is not None)
         return next(usable, candidates[0])
 
     def setup_optimizers(self) -> JointOptimizers:
@@ -78,26 +83,26 @@ class SSATrainer(Trainer):
         return JointOptimizers(self.config.optimizers.copy(), self.pipeline.get_param_groups(), guard)
 
     def setup(self, test_mode: Literal["test", "val", "inference"] = "val") -> None:
-        """Set up as upstream does, and say at the end of the training what became of the artifact.
+        """Set up as upstream does, and report the overlay at the end of the training.
 
-        A resumed run takes over the overlays of its checkpoint: they have to be there before the optimizers are built.
+        The overlays of a resumed run are allocated here, before the optimizers are built.
         """
         self.config.pipeline.artifacts_of = self._resumed_checkpoint()
         super().setup(test_mode)
-        spare_event_writers(self.config.logging.steps_per_log)
-        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._tell_artifact))
+        thin_event_writers(self.config.logging.steps_per_log)
+        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._report_artifact))
 
-    def _tell_artifact(self, step: int) -> None:
+    def _report_artifact(self, step: int) -> None:
         artifacts = self.pipeline.model.artifacts
         for group in range(len(artifacts)):
             name = f"Artifact of camera {group}" if len(artifacts) > 1 else "Artifact"
-            CONSOLE.print(f"[bold]{name}[/bold]: {artifacts.figures(group)}", highlight=False)
+            CONSOLE.print(f"[bold]{name}[/bold]: {artifacts.summary(group)}", highlight=False)
         if len(artifacts):
             config = self.config.get_base_dir() / "config.yml"
             CONSOLE.print(f"ssa export-overlay --load-config {config} --output artifact", soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
-        """Resume as upstream does; without --load-step from the newest checkpoint that is whole, saying which."""
+        """Resume as upstream does; without --load-step from the newest intact checkpoint."""
         folder, step, file = self.config.load_dir, self.config.load_step, self.config.load_checkpoint
         if folder is None and file is None:
             super()._load_checkpoint()
@@ -122,7 +127,7 @@ class SSATrainer(Trainer):
         )
 
     def _load_one(self) -> str | None:
-        """Load what the configuration names; what is wrong with it, if anything is."""
+        """Load the checkpoint that the configuration names; the reason why it cannot be used, or None."""
         try:
             super()._load_checkpoint()
         except InputError:
@@ -134,7 +139,7 @@ class SSATrainer(Trainer):
 
     @check_main_thread
     def save_checkpoint(self, step: int) -> None:
-        """Write a checkpoint, whole and finite or not at all; older ones go only when it is there."""
+        """Write a checkpoint, complete and finite or not at all; older ones are deleted afterwards."""
         if self.optimizers.guard is not None:
             self.optimizers.guard.check(step)
         states = {name: optimizer.state_dict() for name, optimizer in self.optimizers.optimizers.items()}
@@ -147,7 +152,7 @@ class SSATrainer(Trainer):
             )
         folder = self.checkpoint_dir
         try:
-            with written_whole(folder) as self.checkpoint_dir:
+            with atomic_checkpoints(folder) as self.checkpoint_dir:
                 super().save_checkpoint(step)
         except (OSError, RuntimeError) as error:
             earlier = newest_first(folder)
@@ -190,7 +195,7 @@ class SSATrainer(Trainer):
         return loss, {name: value.detach() for name, value in losses.items()}, metrics
 
     def train(self) -> None:
-        """Train up to max_num_iterations steps in all; upstream's resumed runs train that many more."""
+        """Train up to `max_num_iterations` steps in total; upstream's resumed runs train that many more."""
         planned = self.config.max_num_iterations
         self.config.max_num_iterations = max(0, planned - self._start_step)
         if self.config.max_num_iterations == 0:

@@ -1,4 +1,4 @@
-"""nerfstudio's cameras as what a rasterizer takes: view matrices, intrinsics, frame sizes."""
+"""View matrices, intrinsics and frame sizes of nerfstudio's cameras, as rasterizers take them."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from torch import Tensor
 
 
 def metadata(camera: Cameras) -> dict[str, Any]:
-    """What `prepare` left with a camera, or nothing."""
+    """What `prepare` stored with a camera, or an empty dictionary."""
     return camera.metadata or {}
 
 
 def frame(camera: Cameras) -> tuple[int, int]:
-    """Width and height of one camera; from the host where `prepare` left them: reading the device waits for it."""
+    """Width and height of one camera; from the host where `prepare` stored them, because reading the device waits."""
     known = metadata(camera).get("frame")
     return known if known is not None else (int(camera.width.item()), int(camera.height.item()))
 
@@ -40,7 +40,7 @@ def view_matrix(camera_to_world: Tensor) -> Tensor:
 
 
 def prepare(cameras: Cameras, reductions: tuple[int, ...]) -> list[Cameras]:
-    """Cut cameras into single ones that carry in their metadata what a training step asks for, ready on the device.
+    """Split cameras into single ones whose metadata hold what a training step needs, on the device.
 
     Metadata: `cam_idx`, `frame` (width, height on the host), `viewmat` [1, 4, 4], `Ks` {reduction: [1, 3, 3]}.
     """

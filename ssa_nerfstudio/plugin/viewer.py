@@ -1,7 +1,7 @@
-"""The artifact in nerfstudio's viewer: a checkbox, what it shows, a line of figures and a button that saves.
+"""Controls of the overlay in nerfstudio's viewer: a checkbox, a choice of layers, a summary, a button that saves.
 
-The viewer finds elements by walking every public attribute of the model and shows them in the order of the attributes'
-names, hence the letters in front of them. Where no viewer runs, elements answer with their default, and nothing shows.
+The viewer finds elements by walking every public attribute of the model and sorts them by the attributes' names, hence
+the letters in front of the names. Without a viewer elements have their default value, and the overlay is off.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from ssa_nerfstudio.overlay.rgba import over_checkerboard, to_rgba8
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 
 LAYERS = ["composite", "artifact", "matte", "clean"]
-"""What "Show overlay" shows: scene and artifact, the artifact over a checkerboard, its matte, the scene."""
+"""Choices of "Show overlay": the composite, the artifact over a checkerboard, its matte, the clean scene."""
 AUTOMATIC = "of the view"
-"""Choice of camera: the group whose frame the view has, as everywhere else."""
-SECONDS_BETWEEN_FIGURES = 1.0
-"""The line of figures waits for the device, so it is not written anew with every frame."""
+"""Choice of camera: the group whose frame the view has."""
+SECONDS_BETWEEN_SUMMARIES = 1.0
+"""The summary waits for the device, so it is not updated with every frame."""
 
 
-def in_viewer() -> bool:
-    """Whether a viewer draws this frame, and not an evaluation, a render or a training step."""
+def is_viewer_frame() -> bool:
+    """Whether this frame is drawn for a viewer, not for an evaluation, a render or a training step."""
     return isinstance(threading.current_thread(), RenderStateMachine)
 
 
-class OnDemand(dict[str, Any]):
-    """Outputs of a model of which some are functions, called when they are first asked for.
+class LazyOutputs(dict[str, Any]):
+    """Outputs of a model, some of which are functions that are called on first access.
 
-    The viewer lists the outputs by name and reads one of them: what is not read costs nothing.
+    The viewer lists the outputs by name and reads one of them.
     """
 
     def __getitem__(self, name: str) -> Any:
@@ -52,29 +52,29 @@ class OnDemand(dict[str, Any]):
 
 
 class ArtifactControls(nn.Module):
-    """The elements, and the frames they ask for. Holds no parameters."""
+    """The elements, and the frames that they select. Holds no parameters."""
 
     def __init__(self, artifacts: Callable[[], Artifacts]) -> None:
-        """Take where the artifacts are to be found: they are put into the model later, or loaded."""
+        """Take a function that returns the overlays, which are assigned or loaded later."""
         super().__init__()
         self._artifacts = artifacts
-        self._told = 0.0
+        self._summarized = 0.0
         self.a_show = ViewerCheckbox("Show overlay", False, hint="Off: rgb is the clean scene")
         self.b_layer = ViewerDropdown("Layer", LAYERS[0], LAYERS, hint="What is shown where rgb was")
         self.c_strength = ViewerSlider("Strength", 1.0, 0.0, 1.0, 0.05, hint="Factor of the matte")
         self.d_camera = _CameraChoice(lambda: len(artifacts()))
-        self.e_figures = _Line()
+        self.e_summary = _Line()
         self.f_save = _SaveButton(self._picture)
 
     def outputs(self, drawn: dict[str, Any], camera: Cameras, width: int, height: int) -> dict[str, Any]:
-        """A frame of the viewer.
+        """Make a frame of the viewer.
 
         Args:
-            drawn: the clean scene's outputs.
-            camera, width, height: the viewport: the artifact is fitted into it, letterboxed, never stretched.
+            drawn: outputs of the clean scene.
+            camera, width, height: the viewport; the overlay is letterboxed into it, never stretched.
 
         Returns:
-            The outputs with `rgb` as the elements ask for, and composite, overlay_rgb and overlay_alpha on demand.
+            The outputs with `rgb` as the elements select it, and composite, overlay_rgb and overlay_alpha on access.
         """
         show, layer, strength, group = self.a_show.value, self.b_layer.value, self.c_strength.value, self._group()
         clean = drawn["rgb"]
@@ -83,7 +83,7 @@ class ArtifactControls(nn.Module):
         @torch.no_grad()
         def layers() -> tuple[Tensor, Tensor]:
             found = self._artifacts().layers_of_camera(camera, width, height, group)
-            if found is None:  # a camera of a rig with nothing in front
+            if found is None:  # a camera of a rig without an artifact
                 return clean.new_ones(height, width, 1), clean.new_zeros(height, width, 3)
             transmittance, addition = found
             return 1.0 - strength * (1.0 - transmittance), strength * addition
@@ -99,17 +99,17 @@ class ArtifactControls(nn.Module):
             drawn["rgb"] = over_checkerboard(*straight_color(*layers()))
         elif show and layer == "matte":
             drawn["rgb"] = straight_color(*layers())[1].expand_as(clean)
-        if time.monotonic() - self._told > SECONDS_BETWEEN_FIGURES:
-            self._told = time.monotonic()
-            self.e_figures.write(self._artifacts().figures(group or 0))
-        return OnDemand({**drawn, **pictures})
+        if time.monotonic() - self._summarized > SECONDS_BETWEEN_SUMMARIES:
+            self._summarized = time.monotonic()
+            self.e_summary.write(self._artifacts().summary(group or 0))
+        return LazyOutputs({**drawn, **pictures})
 
     def _group(self) -> int | None:
         chosen = self.d_camera.value
         return None if chosen == AUTOMATIC else int(chosen.rpartition(" ")[2])
 
     def _picture(self) -> tuple[str, bytes]:
-        """Name and contents of the file that the button saves."""
+        """Name and content of the file that the button saves."""
         import cv2  # here, so that the commands that never save do not wait for it
 
         group = self._group() or 0
@@ -122,7 +122,7 @@ class ArtifactControls(nn.Module):
 
 
 class _CameraChoice(ViewerDropdown[str]):
-    """Which camera group's artifact to look at; hidden where there is one."""
+    """Chooses the camera group; hidden where there is one."""
 
     def __init__(self, count: Callable[[], int]) -> None:
         super().__init__("Camera", AUTOMATIC, [AUTOMATIC], hint="Whose artifact of a rig's cameras")
@@ -135,10 +135,10 @@ class _CameraChoice(ViewerDropdown[str]):
 
 
 class _Line(ViewerElement[str]):
-    """A line of text. No input, whose update would wait for the lock that the drawing thread holds."""
+    """A line of text. Not an input, whose update would wait for the lock that the rendering thread holds."""
 
     def __init__(self) -> None:
-        super().__init__("Figures")
+        super().__init__("Summary")
         self._handle: viser.GuiMarkdownHandle | None = None
 
     def _create_gui_handle(self, viser_server: viser.ViserServer) -> None:

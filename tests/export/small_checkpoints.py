@@ -40,7 +40,7 @@ def cameras(pairs: list[tuple]) -> Artifacts:
         for _, lens in pairs
     ]
     artifacts = Artifacts()
-    artifacts.put([o for o, _ in pairs], _float64(keys), [], _float64(lenses))
+    artifacts.assign([o for o, _ in pairs], _float64(keys), [], _float64(lenses))
     return artifacts
 
 

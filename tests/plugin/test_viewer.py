@@ -14,7 +14,7 @@ from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.viewer import OnDemand
+from ssa_nerfstudio.plugin.viewer import LazyOutputs
 
 
 class Drawing(RenderStateMachine):
@@ -71,7 +71,7 @@ def choose(model, **values) -> None:
 def test_the_viewer_finds_the_elements_in_order(pipelines):
     found = parse_object(pipelines["on"], ViewerElement, "Custom Elements")
     ours = [(path, element.name) for path, element in found if "/overlay/" in path]
-    assert [name for _, name in ours] == ["Show overlay", "Layer", "Strength", "Camera", "Figures", "Save artifact"]
+    assert [name for _, name in ours] == ["Show overlay", "Layer", "Strength", "Camera", "Summary", "Save artifact"]
     assert {path.rpartition("/")[0] for path, _ in ours} == {"Custom Elements/model/overlay"}
 
 
@@ -136,7 +136,7 @@ def test_light_that_hides_nothing_is_added_and_shown_with_the_least_matte(model,
     torch.testing.assert_close(half["overlay_alpha"], 0.5 * seen["overlay_alpha"])
     choose(model, b_layer="matte")
     torch.testing.assert_close(frame(model, camera)["rgb"], half["overlay_alpha"].expand_as(clean))
-    assert "more than half hidden or lit" in model.artifacts.figures(0)
+    assert "more than half hidden or lit" in model.artifacts.summary(0)
 
 
 @pytest.mark.parametrize(("width", "height"), [(200, 48), (64, 200), (30, 30), (513, 385)])
@@ -185,7 +185,7 @@ def test_one_overlay_of_a_rig_can_be_chosen(model, camera, monkeypatch):
 
 def test_outputs_on_demand_are_computed_once():
     calls = []
-    outputs = OnDemand(a=torch.ones(1), b=lambda: calls.append(1) or torch.zeros(1))
+    outputs = LazyOutputs(a=torch.ones(1), b=lambda: calls.append(1) or torch.zeros(1))
     assert list(outputs) == ["a", "b"]
     assert not calls
     assert outputs["b"] is outputs["b"]

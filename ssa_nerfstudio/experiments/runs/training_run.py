@@ -26,7 +26,7 @@ from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
 from ssa_nerfstudio.experiments.runs.machine import versions
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
-from ssa_nerfstudio.plugin.evaluation import figures_but_flip
+from ssa_nerfstudio.plugin.evaluation import view_metrics_without_flip
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
@@ -196,7 +196,7 @@ def evaluate(pipeline: SSAPipeline, flips: FlipProcesses) -> dict[str, dict[str,
         outputs = pipeline.model.get_outputs_for_camera(camera)
         target = pipeline.model.target(outputs, batch)
         waiting[name] = flips.submit(outputs["rgb"], target)
-        views[name] = figures_but_flip(outputs, target)
+        views[name] = view_metrics_without_flip(outputs, target)
     pipeline.train()
     return {name: {**views[name], "flip": flip.result()} for name, flip in waiting.items()}
 

@@ -1,4 +1,4 @@
-"""Checkpoints that are whole or not there: written beside their folder, moved in when complete."""
+"""Checkpoint files: written beside their folder and moved in when complete, checked when read."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from typing import Any
 import torch
 
 PARTIAL = "checkpoint.partial"
-"""Folder in a run's own folder where a checkpoint is written. A run that is killed while it writes leaves it behind;
-it is never read. (Not in the checkpoints' folder, in which nerfstudio takes every name for a checkpoint's.)"""
+"""Folder of a run in which a checkpoint is written; a killed run leaves it behind, and it is never read. It is not in
+the checkpoints' folder, because nerfstudio takes every name there for a checkpoint's."""
 
 
 def step_of(checkpoint: Path) -> int:
@@ -29,7 +29,7 @@ def newest_first(folder: Path) -> list[Path]:
 
 
 def damage(checkpoint: Path) -> str | None:
-    """What is wrong with a checkpoint's file, or None. torch.load compares no checksums."""
+    """The reason why a checkpoint's file is damaged, or None. (`torch.load` compares no checksums.)"""
     try:
         with zipfile.ZipFile(checkpoint) as archive:
             wrong = archive.testzip()
@@ -39,10 +39,10 @@ def damage(checkpoint: Path) -> str | None:
 
 
 @contextmanager
-def written_whole(folder: Path) -> Iterator[Path]:
-    """Lend a folder to write into; what lies there at the end is moved into `folder` at once, name by name.
+def atomic_checkpoints(folder: Path) -> Iterator[Path]:
+    """Yield a folder to write into, whose files are moved into `folder` when the block ends.
 
-    After an error nothing of it remains and `folder` is what it was.
+    After an error they are removed and `folder` is unchanged.
     """
     partial = folder.parent / PARTIAL
     shutil.rmtree(partial, ignore_errors=True)
@@ -50,7 +50,7 @@ def written_whole(folder: Path) -> Iterator[Path]:
     try:
         yield partial
         for path in partial.iterdir():
-            # The data before the name: a machine that loses its power must not keep the name alone.
+            # Data before name: after a power failure the name must not be there alone.
             with path.open("rb") as file:
                 os.fsync(file.fileno())
             folder.mkdir(parents=True, exist_ok=True)
@@ -59,8 +59,8 @@ def written_whole(folder: Path) -> Iterator[Path]:
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def saved_pipeline(checkpoint: Path) -> dict[str, Any] | None:
-    """The pipeline's state in a checkpoint, mapped and not read; None where the file is none."""
+def load_pipeline_state(checkpoint: Path) -> dict[str, Any] | None:
+    """The pipeline's state in a checkpoint, memory-mapped; None where it cannot be read."""
     try:
         return torch.load(checkpoint, map_location="cpu", mmap=True, weights_only=True)["pipeline"]
     except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError):

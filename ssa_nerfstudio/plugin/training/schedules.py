@@ -1,4 +1,4 @@
-"""Schedules of 30000 steps made to fit a run of another length."""
+"""Scales schedules, which all assume 30,000 steps, to the length of a run."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ Config = TypeVar("Config", bound=TrainerConfig)
 
 FULL_LENGTH = 30_000
 """Steps that every schedule of splatfacto and 3DGS assumes."""
-SHORTEST_REFINEMENT = 10
-"""Refinement is never more frequent than this many steps: its statistics need a few views to mean something."""
-SHORTEST_BETWEEN_PICTURES = 100
-"""Pictures in the log of a shorter run are never nearer to each other than this many steps: each is an evaluation."""
-STEPS_OF_AN_OVERLAY = 7_000
-"""An overlay needs this many steps at its learning rate. Adam moves a logit by no more than that rate a step, so in a
-shorter run it is raised in proportion ..."""
-FASTEST_OVERLAY = 4.0
-"""... up to this factor."""
+MIN_REFINE_EVERY = 10
+"""Lower bound of the steps between two refinements, whose statistics need a few views."""
+MIN_STEPS_PER_IMAGE = 100
+"""Lower bound of the steps between two logged images, each of which is an evaluation."""
+OVERLAY_STEPS = 7_000
+"""Steps that an overlay needs at its learning rate. Adam moves a logit by at most that rate per step, so shorter runs
+raise it in proportion, up to `MAX_OVERLAY_FACTOR`."""
+MAX_OVERLAY_FACTOR = 4.0
+"""Upper bound of that factor."""
 
 _MODEL_STEPS = (
     "warmup_length",
@@ -33,11 +33,11 @@ _MODEL_STEPS = (
 
 
 def scaled(config: Config) -> Config:
-    """A copy of a run's configuration with every schedule scaled by its number of steps / 30000.
+    """Copy a run's configuration with every schedule scaled by its number of steps / 30000.
 
-    Scaled are: learning-rate decay and warm-up, the resolution schedule, spherical harmonics, the refinement's start,
-    stop and interval, and with the interval the opacity resets, which are counted in refinements; so that a short run
-    is seen too, the steps between two pictures in the log; and, below 7000 steps, the overlay's learning rate.
+    Scaled are learning-rate decay and warm-up, the resolution schedule, spherical harmonics, start, stop and interval
+    of the refinement (and with it the opacity resets, which count refinements), the steps between two logged images,
+    and below 7,000 steps the overlay's learning rate.
     """
     config = copy.deepcopy(config)
     factor = config.max_num_iterations / FULL_LENGTH
@@ -45,11 +45,11 @@ def scaled(config: Config) -> Config:
     for name in _MODEL_STEPS:
         steps = getattr(model, name)
         setattr(model, name, max(1, round(steps * factor)) if steps else 0)  # 0 switches a schedule off
-    model.refine_every = max(SHORTEST_REFINEMENT, round(model.refine_every * factor))
-    pictures = max(SHORTEST_BETWEEN_PICTURES, round(config.steps_per_eval_image * factor))
+    model.refine_every = max(MIN_REFINE_EVERY, round(model.refine_every * factor))
+    pictures = max(MIN_STEPS_PER_IMAGE, round(config.steps_per_eval_image * factor))
     config.steps_per_eval_image = min(config.steps_per_eval_image, pictures)  # 0 stays 0: none
-    shortened = STEPS_OF_AN_OVERLAY / max(1, config.max_num_iterations)
-    config.optimizers["overlay"]["optimizer"].lr *= min(FASTEST_OVERLAY, max(1.0, shortened))
+    shortened = OVERLAY_STEPS / max(1, config.max_num_iterations)
+    config.optimizers["overlay"]["optimizer"].lr *= min(MAX_OVERLAY_FACTOR, max(1.0, shortened))
     for entry in config.optimizers.values():
         scheduler = entry["scheduler"]
         if scheduler is not None:
