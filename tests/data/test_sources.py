@@ -1,4 +1,4 @@
-"""Photos and videos on their way in: order, orientation, formats, sizes, frames."""
+"""Photos and videos in a folder: which are taken, and in which order."""
 
 from __future__ import annotations
 
@@ -7,142 +7,68 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from PIL import ExifTags, Image
-from small_captures import write
+from PIL import Image
 
 from ssa_nerfstudio.data.sources import read_source
-from ssa_nerfstudio.sfm.image_pairs import exhaustive_pairs, sequential_pairs
-from ssa_nerfstudio.sfm.ingest import expected_count, ingest
+from ssa_nerfstudio.errors import InputError
 
 
-def gradient(width: int = 64, height: int = 48) -> np.ndarray:
-    """Brighter to the right, redder to the bottom: tells how a photo is turned."""
-    y, x = np.mgrid[:height, :width]
-    return np.stack([255 * y / height, 255 * x / width, 0 * x], axis=-1).astype(np.uint8)
+def touch_photos(folder: Path, *names: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name in names:
+        Image.new("RGB", (64, 48)).save(folder / name)
+    return folder
 
 
-def brought_in(folder: Path, frames: int = 10) -> tuple[Path, list[str]]:
-    dataset = folder.parent / "dataset"
-    dataset.mkdir()
-    source = read_source(folder, "frame", min_photos=1)
-    calls: list[int] = []
-    photos = ingest(source, dataset, frames, lambda: calls.append(1))
-    assert len(calls) == len(photos)
-    assert len(photos) == expected_count(source, frames)
-    return dataset, [photo.source for photo in photos]
-
-
-def test_numbers_in_names_count_as_numbers(tmp_path):
-    write(tmp_path / "photos", [gradient() + np.uint8(number) for number in range(12)])
-    (tmp_path / "photos/.hidden.png").write_text("a file that a system put there")
-    (tmp_path / "photos/notes.txt").write_text("not a photo")
-    dataset, names = brought_in(tmp_path / "photos")
-    assert names == [f"photo_{number}.png" for number in range(12)]
-    for number, path in enumerate(sorted((dataset / "images").iterdir())):
-        assert path.name == f"frame_{number + 1:05d}.png"
-        assert path.read_bytes() == (tmp_path / f"photos/photo_{number}.png").read_bytes()
-
-
-@pytest.mark.parametrize("orientation", range(1, 9))
-@pytest.mark.parametrize("suffix", [".jpg", ".png"])
-def test_photos_are_stored_as_they_are_to_be_looked_at(suffix, orientation, tmp_path):
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    exif[ExifTags.Base.Make] = "maker"
-    write(tmp_path / "photos", [gradient()] * 2, suffix, exif=exif)
-    source = read_source(tmp_path / "photos", "frame", min_photos=1)
-    dataset, _ = brought_in(tmp_path / "photos")
-    stored = Image.open(dataset / f"images/frame_00001{suffix}")
-    assert stored.getexif().get(ExifTags.Base.Orientation, 1) == 1
-    assert stored.getexif()[ExifTags.Base.Make] == "maker"
-    assert stored.size == (source.width, source.height) == ((48, 64) if orientation > 4 else (64, 48))
-    # EXIF 2.3, table 6: change of red and green to the right, then downwards.
-    picture = np.asarray(stored).astype(float)
-    across = picture[:, -8:].mean(axis=(0, 1)) - picture[:, :8].mean(axis=(0, 1))
-    down = picture[-8:].mean(axis=(0, 1)) - picture[:8].mean(axis=(0, 1))
-    expected_signs = {1: (0, 1, 1, 0), 2: (0, -1, 1, 0), 3: (0, -1, -1, 0), 4: (0, 1, -1, 0)} | {
-        5: (1, 0, 0, 1), 6: (-1, 0, 0, 1), 7: (-1, 0, 0, -1), 8: (1, 0, 0, -1)
-    }  # fmt: skip
-    found = np.sign(np.round(np.array([across[0], across[1], down[0], down[1]]) / 100))
-    assert tuple(found) == expected_signs[orientation]
-
-
-def test_photos_beyond_what_nerfstudio_trains_on_get_smaller_copies(tmp_path):
-    write(tmp_path / "photos", [gradient(3300, 30)] * 1, ".jpg")
-    dataset, _ = brought_in(tmp_path / "photos")
-    sizes = {path.parent.name: Image.open(path).size for path in dataset.glob("images*/*.jpg")}
-    assert sizes == {"images": (3300, 30), "images_2": (1650, 15), "images_4": (825, 7)}
-
-
-def test_other_formats_are_converted(tmp_path):
-    write(tmp_path / "photos", [gradient()], ".webp")
-    write(tmp_path / "photos", [gradient()] * 2, ".tiff")
-    dataset, names = brought_in(tmp_path / "photos")
-    assert names == ["photo_0.tiff", "photo_0.webp", "photo_1.tiff"]
-    assert sorted(path.suffix for path in (dataset / "images").iterdir()) == [".jpg", ".png", ".png"]
-    np.testing.assert_array_equal(np.asarray(Image.open(dataset / "images/frame_00001.png")), gradient())
-
-
-def write_video(path: Path, frames: int, sharp: set[int]) -> None:
-    """Frame n of noise is n brighter; only the sharp ones are not blurred."""
-    rng = np.random.default_rng(0)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, (160, 96))
+def write_video(path: Path, frames: int, size: tuple[int, int] = (64, 48)) -> None:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25, size)
     assert writer.isOpened()
-    for number in range(frames):
-        picture = rng.integers(0, 120, (96, 160, 3), dtype=np.uint8) + np.uint8(number)
-        writer.write(picture if number in sharp else cv2.GaussianBlur(picture, (0, 0), 3))
+    for _ in range(frames):
+        writer.write(np.zeros((size[1], size[0], 3), np.uint8))
     writer.release()
 
 
-def test_frames_are_evenly_spaced_and_sharp(tmp_path):
-    (tmp_path / "videos").mkdir()
-    write_video(tmp_path / "videos/a.avi", 100, {13, 34, 48, 78, 88})
-    _, names = brought_in(tmp_path / "videos", frames=5)
-    # 78 is in the fourth part of 20 frames but in its last quarter, which is too near to the next part's.
-    numbers = [int(name.removeprefix("a.avi, frame ")) for name in names]
-    assert numbers[:3] == [13, 34, 48]
-    assert numbers[4] == 88
-    assert np.diff(numbers).min() >= 10
+def test_numbers_in_names_count_as_numbers_and_other_files_are_passed_over(tmp_path):
+    touch_photos(tmp_path, "b.png", "a_10.png", "a_9.png", ".hidden.png")
+    (tmp_path / "notes.txt").write_text("not a photo")
+    source = read_source(tmp_path, "frame", min_photos=3)
+    assert [path.name for path in source.photos] == ["a_9.png", "a_10.png", "b.png"]
+    assert (source.width, source.height, source.orientation) == (64, 48, 1)
 
 
-def test_a_folder_of_videos_is_one_sequence_and_a_short_one_gives_all_its_frames(tmp_path):
-    (tmp_path / "videos").mkdir()
-    write_video(tmp_path / "videos/take_2.avi", 6, set())
-    write_video(tmp_path / "videos/take_10.avi", 3, set())
-    _, names = brought_in(tmp_path / "videos", frames=200)
-    takes = [("take_2", number) for number in range(6)] + [("take_10", number) for number in range(3)]
-    assert names == [f"{take}.avi, frame {number}" for take, number in takes]
-
-
-def test_videos_beside_photos_are_left_out(tmp_path):
-    write(tmp_path / "photos", [gradient()] * 3)
-    write_video(tmp_path / "photos/photo_1.avi", 3, set())
-    source = read_source(tmp_path / "photos", "frame", min_photos=3)
-    assert [path.name for path in source.skipped_videos] == ["photo_1.avi"]
+def test_videos_beside_photos_are_skipped(tmp_path):
+    touch_photos(tmp_path, "0.png", "1.png", "2.png")
+    write_video(tmp_path / "1.avi", 3)
+    source = read_source(tmp_path, "frame", min_photos=3)
+    assert [path.name for path in source.skipped_videos] == ["1.avi"]
     assert len(source.photos) == 3
 
 
-@given(st.lists(st.integers(1, 300), min_size=1, max_size=2))
-def test_pairs_are_of_different_photos_each_once_and_connect_all(counts):
-    passes = [[f"{number}_{photo}" for photo in range(count)] for number, count in enumerate(counts)]
-    names = [name for photos in passes for name in photos]
-    sequential = sequential_pairs(passes)
-    assert len({frozenset(pair) for pair in sequential}) == len(sequential)
-    assert all(one != other for one, other in sequential)
-    reached = {names[0]}
-    neighbors: dict[str, set[str]] = {name: set() for name in names}
-    for one, other in sequential:
-        neighbors[one].add(other)
-        neighbors[other].add(one)
-    left = [names[0]]
-    while left:
-        new = neighbors[left.pop()] - reached
-        reached |= new
-        left += new
-    assert reached == {*names}
-    # Far fewer than all pairs of a long capture.
-    assert len(sequential) <= 16 * len(names) + 60 * 59 * 2 + 60 * 60
-    if sum(counts) <= 40:
-        assert len(exhaustive_pairs(passes)) == len(names) * (len(names) - 1) // 2
+def test_another_file_or_a_changed_one_has_another_fingerprint(tmp_path):
+    def fingerprint() -> list:
+        return read_source(tmp_path, "frame", min_photos=1).fingerprint()
+
+    touch_photos(tmp_path, "0.png", "1.png")
+    former = fingerprint()
+    assert fingerprint() == former
+    (tmp_path / "1.png").unlink()
+    assert fingerprint() != former
+    Image.new("L", (64, 48)).save(tmp_path / "1.png")
+    assert fingerprint() != former
+
+
+def test_frames_are_taken_from_videos_by_their_length(tmp_path):
+    write_video(tmp_path / "a.avi", 30)
+    write_video(tmp_path / "b.avi", 10)
+    frames = list(read_source(tmp_path, "frame", min_photos=1).video_frames(8))
+    assert [video.path.name for video, _, _ in frames] == ["a.avi"] * 6 + ["b.avi"] * 2
+    assert all(picture.shape == (48, 64, 3) for _, _, picture in frames)
+
+
+def test_what_one_camera_cannot_have_taken_is_refused(tmp_path):
+    touch_photos(tmp_path, "0.png", "1.png")
+    with pytest.raises(InputError, match=r"holds 2 photos, 3 are needed; add more"):
+        read_source(tmp_path, "frame", min_photos=3)
+    Image.new("RGB", (48, 64)).save(tmp_path / "2.png")
+    with pytest.raises(InputError, match=r"2.png is 48 x 64, 0.png is 64 x 48; use one folder for each camera"):
+        read_source(tmp_path, "frame", min_photos=3)
