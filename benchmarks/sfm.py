@@ -22,7 +22,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
 from ssa_nerfstudio.sfm.photos_to_dataset import process
-from ssa_nerfstudio.sfm.reconstruction import Settings
+from ssa_nerfstudio.sfm.reconstruction import SfmSettings
 
 WAYS = {
     "COLMAP": (False, False, "none"),
@@ -35,7 +35,7 @@ WAYS = {
 
 
 def measure(
-    photos: Path, mask: np.ndarray | None, detect: bool, settings: Settings, true: dict[str, np.ndarray]
+    photos: Path, mask: np.ndarray | None, detect: bool, settings: SfmSettings, true: dict[str, np.ndarray]
 ) -> dict[str, float]:
     """Runs structure from motion and compares what it found.
 
@@ -110,7 +110,7 @@ class Command:
                 os.link(capture / path, photos / Path(path).name)
             for row in asked:
                 flatten, filter_stationary, mask = WAYS[row["way"]]
-                settings = Settings("exhaustive", self.max_image_size, flatten, filter_stationary, self.threads)
+                settings = SfmSettings("exhaustive", self.max_image_size, flatten, filter_stationary, self.threads)
                 used = _open_part(capture / "layers/raw.npz") if mask == "true" else None
                 result = json.dumps(row | measure(photos, used, mask == "detected", settings, true))
                 print(result, flush=True)

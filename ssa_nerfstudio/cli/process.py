@@ -1,4 +1,4 @@
-"""`ssa process`: the arguments and what they are handed to."""
+"""`ssa process`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Command:
         from ssa_nerfstudio.data.sources import read_source
         from ssa_nerfstudio.sfm.feature_mask import read_mask
         from ssa_nerfstudio.sfm.photos_to_dataset import process
-        from ssa_nerfstudio.sfm.reconstruction import Settings
+        from ssa_nerfstudio.sfm.reconstruction import SfmSettings
 
         for name, lowest in (("frames", 3), ("max_image_size", 64)):
             if (value := getattr(self, name)) < lowest:
@@ -68,28 +68,28 @@ class Command:
         if self.threads < 1 and self.threads != -1:
             raise InputError(f"--threads must be at least 1, or -1 for one a core, got {self.threads}")
         if self.output.exists():
-            raise InputError(f"{self.output} exists already", "remove it or name another folder with --output")
+            raise InputError(f"{self.output} exists already", "remove it or choose another --output")
         two = self.clean is not None
         sources = [read_source(self.train, "train" if two else "frame", min_photos=3)]
         if self.clean is not None:
             sources.append(read_source(self.clean, "clean", min_photos=1))
         first = sources[0]
         mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
-        settings = Settings(self.matching, self.max_image_size, self.flatten, self.filter_stationary, self.threads)
+        settings = SfmSettings(self.matching, self.max_image_size, self.flatten, self.filter_stationary, self.threads)
         console = Console(highlight=False, soft_wrap=True)
         for source in sources:
             if source.skipped_videos:
                 console.print(f"{source.path}: {len(source.skipped_videos)} videos beside the photos are left out")
 
-        outcome = process(sources, self.output, mask, self.detect, self.frames, self.min_registered, settings, console)
+        summary = process(sources, self.output, mask, self.detect, self.frames, self.min_registered, settings, console)
 
-        for each in outcome.passes:
+        for each in summary.passes:
             missing = ", ".join([*each.missing[:5], *["..."][: len(each.missing) > 5]])
             left_out = f"; not: {missing}" if missing else ""
             console.print(f"{each.count} of {each.photos} {each.name} photos registered{left_out}")
-        if self.detect and not outcome.masked:
+        if self.detect and not summary.masked:
             console.print("no opaque artifact was detected: nothing was masked")
-        if outcome.masked:
-            console.print(f"{outcome.masked:.0%} of the frame was masked")
-        console.print(f"{outcome.points} points, mean reprojection error {outcome.reprojection_error:.2f} pixels")
+        if summary.masked:
+            console.print(f"{summary.masked:.0%} of the frame was masked")
+        console.print(f"{summary.points} points, mean reprojection error {summary.reprojection_error:.2f} pixels")
         console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}")

@@ -1,4 +1,7 @@
-"""Structure from motion with pycolmap; features and matches go on where they were interrupted."""
+"""The child process of `reconstruction.py`: structure from motion with pycolmap, resumable.
+
+Features and matches that an earlier run stored in the database are kept.
+"""
 
 from __future__ import annotations
 
@@ -15,38 +18,39 @@ import pycolmap
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
 from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
-from ssa_nerfstudio.sfm.reconstruction import JOB, MODEL, Pass, Report, Settings
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+from ssa_nerfstudio.sfm.reconstruction import JOB, MODEL, Pass, SfmSettings
 
-_PAIRS_A_CALL = 64
-"""Matched and stored together: what a kill can cost, and how often the progress bar moves."""
-_PHOTOS_A_THREAD = 2
+_PAIRS_PER_CALL = 64
+"""Pairs that are matched and stored at once: the loss when the process is killed, and the grain of the progress bar."""
+_PHOTOS_PER_THREAD = 2
 
 pycolmap.logging.minloglevel = 3
 
 
-class Structure:
-    """A database of features and matches in a folder of its own, and what is mapped from it."""
+class StructureFromMotion:
+    """A database of features and matches, and the model that is mapped from it."""
 
-    def __init__(self, images: Path, passes: Sequence[Pass], folder: Path, settings: Settings) -> None:
-        """Take what to work on.
+    def __init__(self, images: Path, passes: Sequence[Pass], folder: Path, settings: SfmSettings) -> None:
+        """Store the arguments.
 
         Args:
             images: folder of the photos.
-            passes: each has one camera of its own; all are mapped together.
+            passes: each has a camera of its own; all are mapped together.
             folder: exists; what an earlier run with the same arguments left there is used.
-            settings: how.
+            settings: settings of structure from motion.
         """
         self._images, self._passes, self._folder, self._settings = images, passes, folder, settings
         self._database = folder / "database.db"
 
-    def extract(self, report: Report) -> None:
-        """Finds SIFT features in all photos that have none yet; one OPENCV camera a pass."""
+    def extract(self, on_progress: ProgressCallback) -> None:
+        """Extract SIFT features of all photos that have none yet; one OPENCV camera per pass."""
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = self._settings.threads
         options.max_image_size = self._settings.max_image_size
         total = sum(len(each.photos) for each in self._passes)
         with pycolmap.Database.open(self._database) as database:
-            known = {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
+            done = {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
         for number, each in enumerate(self._passes, 1):
             reader = pycolmap.ImageReaderOptions()
             reader.camera_model = "OPENCV"
@@ -58,9 +62,9 @@ class Structure:
                     camera.camera_id = number
                     database.write_camera(camera, use_camera_id=True)
             reader.existing_camera_id = number
-            left = iter([name for name in each.photos if name not in known])
-            while names := list(islice(left, _PHOTOS_A_THREAD * self._threads)):
-                report("features", len(known), total)
+            remaining = iter([name for name in each.photos if name not in done])
+            while names := list(islice(remaining, _PHOTOS_PER_THREAD * self._threads)):
+                on_progress("features", len(done), total)
                 pycolmap.extract_features(
                     self._database,
                     each.folder,
@@ -68,11 +72,11 @@ class Structure:
                     reader_options=reader,
                     extraction_options=options,
                 )
-                known |= {*names}
-        report("features", total, total)
+                done |= {*names}
+        on_progress("features", total, total)
 
-    def match(self, report: Report) -> None:
-        """Matches and verifies all pairs that have not been matched yet."""
+    def match(self, on_progress: ProgressCallback) -> None:
+        """Match all pairs that have not been matched yet, and verify the matches geometrically."""
         matching = pycolmap.FeatureMatchingOptions()
         matching.num_threads = self._settings.threads
         geometry = pycolmap.TwoViewGeometryOptions()
@@ -83,23 +87,23 @@ class Structure:
         pairs = self._pairs()
         with pycolmap.Database.open(self._database) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
-            left = [pair for pair in pairs if not database.exists_two_view_geometry(*(ids[n] for n in pair))]
-        done = len(pairs) - len(left)
-        batches = iter(left)
-        while batch := list(islice(batches, _PAIRS_A_CALL)):
-            report("matches", done, len(pairs))
+            remaining = [pair for pair in pairs if not database.exists_two_view_geometry(*(ids[n] for n in pair))]
+        done = len(pairs) - len(remaining)
+        batches = iter(remaining)
+        while batch := list(islice(batches, _PAIRS_PER_CALL)):
+            on_progress("matches", done, len(pairs))
             Path(pairing.match_list_path).write_text("".join(f"{one} {other}\n" for one, other in batch))
             pycolmap.match_image_pairs(self._database, matching, pairing, geometry)
             done += len(batch)
-        report("matches", len(pairs), len(pairs))
+        on_progress("matches", len(pairs), len(pairs))
 
-    def map(self, report: Report) -> None:
-        """Maps incrementally and stores the reconstruction with most photos; none where no two photos match."""
+    def map(self, on_progress: ProgressCallback) -> None:
+        """Map incrementally and store the model of most photos; none where no two photos match."""
         total = sum(len(each.photos) for each in self._passes)
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = self._settings.threads
         options.random_seed = 0
-        # A capture of few photos is whole although it is smaller than what COLMAP would keep.
+        # COLMAP's default would drop the complete model of a capture of few photos.
         options.min_model_size = min(10, max(3, total // 2))
         models = self._folder / "models"
         for earlier in (models, self._folder / MODEL):
@@ -107,19 +111,19 @@ class Structure:
         models.mkdir()
         registered = 2
 
-        def on_photo() -> None:
+        def on_registered() -> None:
             nonlocal registered
             registered += 1
-            report("poses", min(registered, total), total)
+            on_progress("poses", min(registered, total), total)
 
-        report("poses", 0, total)
+        on_progress("poses", 0, total)
         found = pycolmap.incremental_mapping(
-            self._database, self._images, models, options, next_image_callback=on_photo
+            self._database, self._images, models, options, next_image_callback=on_registered
         )
         if found:
             (self._folder / MODEL).mkdir()
             max(found.values(), key=lambda model: model.num_reg_images()).write_binary(self._folder / MODEL)
-        report("poses", total, total)
+        on_progress("poses", total, total)
 
     def _pairs(self) -> list[tuple[str, str]]:
         photos = [each.photos for each in self._passes]
@@ -134,18 +138,18 @@ class Structure:
 
 
 def _main(folder: Path) -> None:
-    """The child process of `apart.reconstruct`: reports as lines of JSON, and ends when its parent does."""
+    """Do the job in a folder, report progress as lines of JSON, and end when the parent does."""
 
-    def report(*what: str | int) -> None:
-        print(json.dumps(what), flush=True)
+    def on_progress(*values: str | int) -> None:
+        print(json.dumps(values), flush=True)
 
     end_with_parent()
-    told = json.loads((folder / JOB).read_text(encoding="utf-8"))
-    passes = [Pass(**each) for each in told["passes"]]
-    structure = Structure(Path(told["images"]), passes, folder, Settings(**told["settings"]))
-    structure.extract(report)
-    structure.match(report)
-    structure.map(report)
+    job = json.loads((folder / JOB).read_text(encoding="utf-8"))
+    passes = [Pass(**each) for each in job["passes"]]
+    sfm = StructureFromMotion(Path(job["images"]), passes, folder, SfmSettings(**job["settings"]))
+    sfm.extract(on_progress)
+    sfm.match(on_progress)
+    sfm.map(on_progress)
 
 
 if __name__ == "__main__":

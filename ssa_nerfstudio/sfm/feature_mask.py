@@ -1,4 +1,4 @@
-"""The mask of a pass: where structure from motion looks, and where the artifact is."""
+"""Masks for feature extraction: read from a file, checked, widened."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from PIL import Image
 
 from ssa_nerfstudio.errors import InputError
 
-_LEAST_OPEN = 0.05
-"""Share of the frame that a mask must leave open: less is a mask of the other polarity, or of no use."""
+_MIN_USED = 0.05
+"""Share of the frame that a mask has to leave: less is a mask of the other polarity, or of no use."""
 _MARGIN = 0.01
-"""Widening of the masked part, relative to the frame's longer side: descriptors reach beyond their point."""
+"""Widening of the masked part, relative to the longer side: descriptors extend beyond their keypoint."""
 
 
 def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np.ndarray:
-    """Reads a mask in the polarity that COLMAP and nerfstudio share: black (0) is ignored, all else is used.
+    """Read a mask in the polarity of COLMAP and nerfstudio: black (0) is ignored, all else is used.
 
     Args:
         path: a picture of the raw frame's shape; one of another size is scaled, nearest neighbor.
@@ -50,7 +50,7 @@ def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np
 
 
 def checked(used: np.ndarray, name: str) -> np.ndarray:
-    """The mask itself, if it leaves enough of the frame.
+    """Return the mask if it leaves enough of the frame.
 
     Args:
         used: bool [H, W], True where photos are used.
@@ -59,16 +59,16 @@ def checked(used: np.ndarray, name: str) -> np.ndarray:
     Raises:
         InputError: it leaves less than 5 % of the frame.
     """
-    if used.mean() < _LEAST_OPEN:
+    if used.mean() < _MIN_USED:
         raise InputError(
             f"{name} leaves {used.mean():.1%} of the frame: black is ignored",
-            "add --invert-mask if white marks the artifact",
+            "invert the mask if white marks the artifact",
         )
     return used
 
 
 def widened(used: np.ndarray) -> np.ndarray:
-    """The mask with its masked part widened by 1 % of the longer side, against features that look across its edge."""
+    """Widen the masked part by 1 % of the longer side, so that descriptors do not extend into it."""
     margin = max(1, round(_MARGIN * max(used.shape)))
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
     # Outside the frame nothing is masked: erosion must not eat in from the border.

@@ -17,6 +17,8 @@ from ssa_nerfstudio.data.writing import staged_file
 
 _MAX_TRAINING_SIZE = 1600
 """Longest side that nerfstudio trains on without being asked, pixels. Beyond it looks for images_2, images_4, ..."""
+_RECORD = ".json"
+"""Suffix of the hidden file that lists a pass's photos once all are in."""
 _LOSSLESS = {".png", ".tif", ".tiff", ".bmp"}
 _QUALITY = {"JPEG": {"quality": 95, "subsampling": 0}, "PNG": {"compress_level": 1}}
 
@@ -51,7 +53,7 @@ def ingest(source: Source, dataset: Path, frames: int, advance: Callable[[], Non
         InputError: a photo cannot be decoded.
         OSError: a file cannot be written.
     """
-    record = dataset / f".{source.name}.json"
+    record = dataset / f".{source.name}{_RECORD}"
     if record.is_file():
         photos = [Photo(**photo) for photo in json.loads(record.read_text(encoding="utf-8"))]
         for _ in photos:
@@ -66,6 +68,12 @@ def ingest(source: Source, dataset: Path, frames: int, advance: Callable[[], Non
     with staged_file(record) as part:
         part.write_text(json.dumps([asdict(photo) for photo in photos]), encoding="utf-8")
     return photos
+
+
+def remove_records(dataset: Path) -> None:
+    """Remove from a complete dataset what interrupted runs need."""
+    for record in dataset.glob(f".*{_RECORD}"):
+        record.unlink()
 
 
 def expected_count(source: Source, frames: int) -> int:

@@ -1,12 +1,17 @@
-"""A reconstruction as nerfstudio reads it: transforms.json and sparse_pc.ply, in ns-process-data's frame."""
+"""A reconstruction as a nerfstudio dataset: transforms.json, sparse_pc.ply and COLMAP's model, as ns-process-data has
+them."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import PIL.Image
+
+from ssa_nerfstudio.sfm.ingest import Photo, remove_records
 
 if TYPE_CHECKING:
     import pycolmap
@@ -15,18 +20,44 @@ APPLIED_TRANSFORM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
 """From COLMAP's world, whose first camera looks along z with y down, to nerfstudio's with z up, [3, 4]."""
 POINTS = "sparse_pc.ply"
 """File of the points."""
+MASK = "mask_colmap.png"
+"""File of the mask of the first pass: black is ignored, as by COLMAP and nerfstudio."""
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
 
 
-def transforms(reconstruction: pycolmap.Reconstruction, sources: Mapping[str, str]) -> dict[str, Any]:
-    """transforms.json of the registered photos, without a split.
+def write_dataset(
+    dataset: Path, photos: Sequence[Sequence[Photo]], model: pycolmap.Reconstruction, mask: np.ndarray | None
+) -> None:
+    """Complete a dataset that has its photos already; transforms.json comes last.
 
-    One camera is stated once, several with their frames. Poses are camera to world, OpenGL axes, as
-    `nerfstudio.process_data.colmap_utils.colmap_to_json` has them.
+    Args:
+        dataset: folder that holds images/.
+        photos: the photos of each pass, those of the first train and those of a second test.
+        model: their reconstruction.
+        mask: bool [height, width] of the first pass, True where features could lie; None: no file is written.
+    """
+    sparse = dataset / "colmap" / "sparse" / "0"
+    sparse.mkdir(parents=True, exist_ok=True)
+    model.write_binary(sparse)
+    write_points(dataset / POINTS, model)
+    if mask is not None:
+        PIL.Image.fromarray(mask).save(dataset / MASK)
+    meta = transforms(model, {photo.name: photo.source for each in photos for photo in each})
+    if len(photos) > 1:
+        meta = split(meta, *([photo.name for photo in each] for each in photos))
+    remove_records(dataset)
+    (dataset / "transforms.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+
+
+def transforms(reconstruction: pycolmap.Reconstruction, sources: Mapping[str, str]) -> dict[str, Any]:
+    """Contents of transforms.json for the registered photos, without a split.
+
+    A single camera is stated once, several are stated in their frames. Poses are camera to world with OpenGL axes, as
+    in `nerfstudio.process_data.colmap_utils.colmap_to_json`.
 
     Args:
         reconstruction: its cameras are of model OPENCV.
-        sources: for each photo the file it was.
+        sources: for each photo the file that it was made from.
     """
     cameras = {number: _intrinsics(camera) for number, camera in reconstruction.cameras.items()}
     images = sorted((image for image in reconstruction.images.values() if image.has_pose), key=lambda image: image.name)
@@ -51,10 +82,10 @@ def transforms(reconstruction: pycolmap.Reconstruction, sources: Mapping[str, st
 
 
 def split(meta: dict[str, Any], train: Sequence[str], test: Sequence[str]) -> dict[str, Any]:
-    """transforms.json with a split: lists of the registered among the photos of two passes.
+    """Contents of transforms.json with the registered photos of two passes as training and test split.
 
     Args:
-        meta: transforms.json.
+        meta: contents without a split.
         train, test: photos of the passes, files in images/.
     """
     registered = {frame["file_path"] for frame in meta["frames"]}
@@ -63,7 +94,7 @@ def split(meta: dict[str, Any], train: Sequence[str], test: Sequence[str]) -> di
 
 
 def write_points(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
-    """Stores the points in nerfstudio's world as binary PLY: float x, y, z and uchar red, green, blue."""
+    """Write the points in nerfstudio's world as binary PLY: float x, y, z and uchar red, green, blue."""
     points = list(reconstruction.points3D.values())
     table = np.empty(len(points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
     if points:

@@ -1,11 +1,9 @@
-"""From folders of photos or videos to a nerfstudio dataset."""
+"""From photos or videos to a nerfstudio dataset."""
 
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +11,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import PIL.Image
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
@@ -21,49 +18,28 @@ from ssa_nerfstudio.sfm.detected_mask import detected_mask
 from ssa_nerfstudio.sfm.feature_mask import widened
 from ssa_nerfstudio.sfm.flat_field import MIN_PHOTOS, static_factor, write_flattened
 from ssa_nerfstudio.sfm.ingest import Photo, expected_count, ingest
-from ssa_nerfstudio.sfm.nerfstudio_dataset import POINTS, split, transforms, write_points
-from ssa_nerfstudio.sfm.reconstruction import Pass, Report, Settings, reconstruct
-from ssa_nerfstudio.sfm.resumable_work import Work, resumable_work
+from ssa_nerfstudio.sfm.nerfstudio_dataset import MASK, write_dataset
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback, progress_display
+from ssa_nerfstudio.sfm.reconstruction import Pass, SfmSettings, reconstruct
+from ssa_nerfstudio.sfm.registration import PassRegistration, check_registrations, registrations
+from ssa_nerfstudio.sfm.work_folder import resumable_work
 
 if TYPE_CHECKING:
     import pycolmap
 
-MASK = "mask_colmap.png"
-"""The mask that was used, beside transforms.json: black is ignored, as COLMAP and nerfstudio both have it."""
-
 
 @dataclass(frozen=True)
-class Registered:
-    """What structure from motion gave for one pass."""
+class Summary:
+    """What processing found."""
 
-    name: str
-    photos: int
-    """That there are."""
-    missing: tuple[str, ...]
-    """Sources of those that could not be registered."""
-
-    @property
-    def count(self) -> int:
-        """How many were registered."""
-        return self.photos - len(self.missing)
-
-    @property
-    def share(self) -> float:
-        """Of the photos that were registered, in [0, 1]."""
-        return self.count / self.photos
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What was found."""
-
-    passes: tuple[Registered, ...]
-    """The training photos first."""
+    passes: tuple[PassRegistration, ...]
+    """Registration of each pass, the training photos first."""
     points: int
+    """Number of 3D points."""
     reprojection_error: float
     """Mean over the points' observations, pixels of the photos."""
     masked: float
-    """Share of the first pass's frame in which no features were looked for, in [0, 1]."""
+    """Share of the first pass's frame that is masked, in [0, 1]."""
 
 
 def process(
@@ -73,170 +49,116 @@ def process(
     detect: bool = False,
     frames: int = 200,
     min_registered: float = 0.5,
-    settings: Settings | None = None,
+    settings: SfmSettings | None = None,
     console: Console | None = None,
-) -> Outcome:
-    """Writes a nerfstudio dataset: images/, transforms.json, sparse_pc.ply and COLMAP's model in colmap/sparse/0.
+) -> Summary:
+    """Write a nerfstudio dataset: images/, transforms.json, sparse_pc.ply and COLMAP's model in colmap/sparse/0.
 
-    All passes are mapped together, each with one camera of its own. Where there are two, the photos of the first train
-    and those of the second test. The output appears only when it is complete; until then work lies in `.NAME.work`
-    beside it, from which the next run with the same arguments goes on.
+    All passes are mapped together, each with a camera of its own. Where there are two, the photos of the first train
+    and those of the second test. The output appears only when it is complete. Until then work lies in `.NAME.work`
+    beside it, from which the next run with the same arguments continues.
 
     Args:
         sources: the passes, one or two, the one to train on first.
         output: folder to make.
         mask: bool [height, width] for the first pass, True where features may lie.
-        detect: whether to look for an opaque artifact in the first pass, and to mask it, where no mask is given.
-        frames: to take from a pass of videos, at least 1.
-        min_registered: the least share of each pass's photos, in [0, 1].
-        settings: of structure from motion.
-        console: takes the progress bar; none is drawn where it is no terminal.
+        detect: whether to detect an opaque artifact in the first pass and mask it, where no mask is given.
+        frames: number of frames to take from a pass of videos, at least 1.
+        min_registered: required share of registered photos of each pass, in [0, 1].
+        settings: settings of structure from motion.
+        console: where progress is shown.
 
     Raises:
         InputError: a photo is broken, too few were registered, or the output cannot be written.
     """
-    settings = settings or Settings()
-    console = console or Console()
+    settings = settings or SfmSettings()
     mask = None if mask is None else widened(mask)
-    with resumable_work(output) as work, _progress(console) as report:
-        made_from = [(source.name, source.fingerprint(), frames) for source in sources]
-        dataset = work.room("dataset", made_from)
-        photos = _ingest(sources, dataset, frames, report)
+    with resumable_work(output) as work, progress_display(console or Console()) as on_progress:
+        inputs = [(source.name, source.fingerprint(), frames) for source in sources]
+        dataset = work.subfolder("dataset", inputs)
+        photos = _ingest_all(sources, dataset, frames, on_progress)
         if detect and mask is None:
             files = [dataset / "images" / photo.name for photo in photos[0]]
-            mask = detected_mask(files, lambda done: report("detection", done, len(files)))
+            mask = detected_mask(files, lambda done: on_progress("detection", done, len(files)))
             mask = None if mask is None else widened(mask)
-        motion = work.room("motion", [made_from, _digest(mask), asdict(settings) | {"threads": None}])
-        if mask is not None:
-            PIL.Image.fromarray(mask).save(motion / MASK)
-        names = [[photo.name for photo in each] for each in photos]
-        passes = [Pass(each, str(dataset / "images")) for each in names]
-        looked_at = _flatten(names[0], dataset / "images", motion / "flat", settings, report)
-        passes[0] = Pass(names[0], str(looked_at), None if mask is None else str(motion / MASK))
-        found = reconstruct(dataset / "images", passes, motion, settings, report)
+        motion = work.subfolder("motion", [inputs, _digest(mask), asdict(settings) | {"threads": None}])
+        passes = _passes(photos, dataset / "images", motion, mask, settings, on_progress)
+        found = reconstruct(dataset / "images", passes, motion, settings, on_progress)
         model = found and _load(found)
-        outcome = _judge(work, sources, photos, model, min_registered, mask)
+        registered = registrations([source.name for source in sources], photos, model)
+        try:
+            check_registrations(registered, min_registered, masked=mask is not None)
+        except InputError as error:
+            work.keep_after_error = True
+            remedy = f"{error.remedy}; a run that requires fewer continues from the work in {work.path}"
+            raise InputError(error.problem, remedy) from error
         assert model is not None
-        _finish(dataset, sources, photos, model, mask)
+        write_dataset(dataset, photos, model, mask)
         dataset.rename(output)
-        work.discard()
-    return outcome
+        work.remove()
+    masked = 0.0 if mask is None else float(1 - mask.mean())
+    return Summary(registered, model.num_points3D(), model.compute_mean_reprojection_error(), masked)
 
 
-@contextmanager
-def _progress(console: Console) -> Iterator[Report]:
-    """A bar a stage with the time that is left; where there is no terminal, a line when a stage is done."""
-    columns = (TextColumn("{task.description:<10}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    bars = Progress(
-        *columns, TextColumn("left:"), TimeRemainingColumn(), console=console, disable=not console.is_terminal
-    )
-    tasks = {}
-    finished: set[str] = set()
-
-    def report(stage: str, done: int, total: int) -> None:
-        if stage not in tasks:
-            tasks[stage] = bars.add_task(stage, total=total, completed=done)
-        bars.update(tasks[stage], completed=done, total=total)
-        if done == total and stage not in finished and not console.is_terminal:
-            console.print(f"{stage}: {total}")
-        finished.update({stage} if done == total else ())
-
-    with bars:
-        yield report
-
-
-def _load(model: Path) -> pycolmap.Reconstruction:
-    # Late, because COLMAP takes over the process's signals; after PIL, because saving a PNG would abort otherwise.
-    import pycolmap
-
-    return pycolmap.Reconstruction(model)
-
-
-def _ingest(sources: Sequence[Source], dataset: Path, frames: int, report: Report) -> list[list[Photo]]:
+def _ingest_all(
+    sources: Sequence[Source], dataset: Path, frames: int, on_progress: ProgressCallback
+) -> list[list[Photo]]:
     total = sum(expected_count(source, frames) for source in sources)
     done = 0
 
     def advance() -> None:
         nonlocal done
         done += 1
-        report("photos", min(done, total), total)
+        on_progress("photos", min(done, total), total)
 
-    report("photos", 0, total)
+    on_progress("photos", 0, total)
     photos = [ingest(source, dataset, frames, advance) for source in sources]
-    report("photos", total, total)
+    on_progress("photos", total, total)
     return photos
 
 
-def _flatten(names: list[str], images: Path, folder: Path, settings: Settings, report: Report) -> Path:
-    """Folder of the photos without what is the same in all of them: their own where nothing is, or it is not asked."""
+def _passes(
+    photos: Sequence[Sequence[Photo]],
+    images: Path,
+    folder: Path,
+    mask: np.ndarray | None,
+    settings: SfmSettings,
+    on_progress: ProgressCallback,
+) -> list[Pass]:
+    """Where features of each pass are extracted: the first pass has a mask and flattened copies, if there are any."""
+    passes = [Pass([photo.name for photo in each], str(images)) for each in photos]
+    if mask is not None:
+        PIL.Image.fromarray(mask).save(folder / MASK)
+    names = passes[0].photos
+    copies = _flatten(names, images, folder / "flat", settings, on_progress)
+    return [Pass(names, str(copies), None if mask is None else str(folder / MASK)), *passes[1:]]
+
+
+def _flatten(
+    names: list[str], images: Path, folder: Path, settings: SfmSettings, on_progress: ProgressCallback
+) -> Path:
+    """Folder of the photos without their static factor; `images` where they have none or settings disable it."""
     if not settings.flatten or len(names) < MIN_PHOTOS:
         return images
     done = sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
     if done < len(names):
-        report("artifact", 0, len(names))
+        on_progress("artifact", 0, len(names))
         factor = static_factor([images / name for name in names], settings.max_image_size)
         if factor is None:
-            report("artifact", len(names), len(names))
+            on_progress("artifact", len(names), len(names))
             return images
         folder.mkdir(exist_ok=True)
         for number, name in enumerate(names, 1):
             write_flattened(images / name, folder / name, factor)
-            report("artifact", number, len(names))
+            on_progress("artifact", number, len(names))
     return folder
 
 
-def _judge(
-    work: Work,
-    sources: Sequence[Source],
-    photos: Sequence[Sequence[Photo]],
-    model: pycolmap.Reconstruction | None,
-    min_registered: float,
-    mask: np.ndarray | None,
-) -> Outcome:
-    images = [] if model is None else [image for image in model.images.values() if image.has_pose]
-    registered = {image.name for image in images}
-    passes = tuple(
-        Registered(source.name, len(each), tuple(photo.source for photo in each if photo.name not in registered))
-        for source, each in zip(sources, photos, strict=True)
-    )
-    for each in passes:
-        if each.share < min_registered or each.count == 0:
-            work.kept = True
-            remedy = (
-                "take photos that overlap more"
-                if mask is not None
-                else "give --mask if something covers part of every frame, or photos that overlap more"
-            )
-            raise InputError(
-                f"only {each.count} of {each.photos} {each.name} photos could be registered, {min_registered:.0%} "
-                f"are asked for: {remedy}",
-                f"--min-registered takes less, and goes on from the work in {work.folder}",
-            )
-    assert model is not None
-    masked = 0.0 if mask is None else float(1 - mask.mean())
-    return Outcome(passes, model.num_points3D(), model.compute_mean_reprojection_error(), masked)
+def _load(model: Path) -> pycolmap.Reconstruction:
+    # Late, because COLMAP replaces the signal handlers; after PIL, because saving a PNG would abort otherwise.
+    import pycolmap
 
-
-def _finish(
-    dataset: Path,
-    sources: Sequence[Source],
-    photos: Sequence[Sequence[Photo]],
-    model: pycolmap.Reconstruction,
-    mask: np.ndarray | None,
-) -> None:
-    sparse = dataset / "colmap" / "sparse" / "0"
-    sparse.mkdir(parents=True, exist_ok=True)
-    model.write_binary(sparse)
-    write_points(dataset / POINTS, model)
-    if mask is not None:
-        PIL.Image.fromarray(mask).save(dataset / MASK)
-    meta = transforms(model, {photo.name: photo.source for each in photos for photo in each})
-    if len(sources) > 1:
-        meta = split(meta, *([photo.name for photo in each] for each in photos))
-    for source in sources:
-        (dataset / f".{source.name}.json").unlink(missing_ok=True)
-    # Last, because it is what makes the folder a dataset.
-    (dataset / "transforms.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
+    return pycolmap.Reconstruction(model)
 
 
 def _digest(mask: np.ndarray | None) -> str | None:

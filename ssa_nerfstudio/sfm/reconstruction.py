@@ -1,4 +1,9 @@
-"""Structure from motion in a process of its own: COLMAP's threads abort the process where a disk is full."""
+"""Structure from motion in a child process.
+
+COLMAP runs threads of its own. When one of them cannot write, because the disk is full, it throws where nothing can
+catch it, and the whole process is aborted; COLMAP also replaces the process's signal handlers. In a child process
+(`colmap.py`) an abort is an exit code, and the parent can say what went wrong and keep what is worth keeping.
+"""
 
 from __future__ import annotations
 
@@ -6,64 +11,65 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-MODEL = "model"
-"""Folder of the model that was chosen, in COLMAP's binary files; missing where none was found."""
-JOB = "job.json"
-"""What the child is to do."""
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 
-Report = Callable[[str, int, int], None]
-"""Called with the stage's name, how much is done and how much there is."""
+MODEL = "model"
+"""Folder of the chosen model, in COLMAP's binary files; missing where none was found."""
+JOB = "job.json"
+"""File that tells the child what to do."""
 
 
 @dataclass(frozen=True)
 class Pass:
-    """Photos of one camera."""
+    """Photos of one camera, taken in one pass over the scene."""
 
     photos: list[str]
     """Files in the folder of images, in order."""
     folder: str
-    """Where features are looked for: copies of the photos, of the same names and size, or the photos themselves."""
+    """Folder in which features are extracted: the photos, or copies of the same names and size."""
     mask: str | None = None
-    """File of a mask: no feature lies where it is black; None: features lie everywhere."""
+    """File of a mask, black where no feature may lie; None: features may lie everywhere."""
 
 
 @dataclass(frozen=True)
-class Settings:
-    """How structure from motion is done."""
+class SfmSettings:
+    """Settings of structure from motion."""
 
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """Which pairs are matched; auto: all of them up to 150 photos."""
+    """Which pairs are matched; auto: all of them up to 150 photos, else sequential."""
     max_image_size: int = 1600
-    """Longest side of the photos that features are looked for in, pixels."""
+    """Longest side of the photos in which features are extracted, pixels."""
     flatten: bool = True
-    """Whether features are looked for in photos without what is the same in all of them."""
+    """Whether features of the first pass are extracted in photos without their static factor (`flat_field`)."""
     filter_stationary: bool = True
-    """Whether matches that lie at the same place of both frames (within 4 pixels) are dropped."""
+    """Whether matches at the same place of both frames (within 4 pixels) are dropped."""
     threads: int = -1
-    """-1: one a core."""
+    """Number of threads; -1: one per core."""
 
 
-def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Settings, report: Report) -> Path | None:
-    """Extracts, matches and maps in a child process that ends with this one, whatever ends it.
+def reconstruct(
+    images: Path, passes: Sequence[Pass], folder: Path, settings: SfmSettings, on_progress: ProgressCallback
+) -> Path | None:
+    """Extract features, match and map in a child process that ends with this one, even when this one is killed.
 
     Args:
         images: folder of the photos.
         passes: each has one camera.
         folder: exists; what an earlier run left there is used.
-        settings: how.
-        report: called with what the child reports.
+        settings: settings of structure from motion.
+        on_progress: called with what the child reports.
 
     Returns:
-        The folder of the model, or None where no two photos could be set against each other.
+        The folder of the model, or None where no two photos match.
 
     Raises:
-        MemoryError: the child was killed from outside, which is what systems without memory left do.
-        OSError: the child ended abnormally, which is how COLMAP tells that it cannot write.
+        MemoryError: the child was killed from outside, which operating systems do when memory runs out.
+        OSError: the child ended abnormally, which is how COLMAP reports that it cannot write.
     """
     job = {"images": str(images), "passes": [asdict(each) for each in passes], "settings": asdict(settings)}
     (folder / JOB).write_text(json.dumps(job), encoding="utf-8")
@@ -80,7 +86,7 @@ def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Se
         assert child.stdout is not None
         try:
             for line in child.stdout:
-                report(*json.loads(line))
+                on_progress(*json.loads(line))
             child.wait()
         finally:
             child.kill()
@@ -88,14 +94,14 @@ def reconstruct(images: Path, passes: Sequence[Pass], folder: Path, settings: Se
             child.stdin.close()
             child.stdout.close()
     if child.returncode == -signal.SIGKILL:
-        raise MemoryError("structure from motion was killed, most likely for lack of memory: lower --threads")
+        raise MemoryError("structure from motion was killed, most likely for lack of memory: use fewer threads")
     if child.returncode:
         raise OSError(f"COLMAP: {_reason(log)}")
     return folder / MODEL if (folder / MODEL).is_dir() else None
 
 
 def _reason(log: Path) -> str:
-    """What COLMAP said before it ended."""
+    """Find COLMAP's last error in its log."""
     lines = log.read_text(errors="replace").splitlines()
-    said = [line for line in lines if "what():" in line] or [line for line in lines if "Error" in line]
-    return " ".join(said[-1].split())[:200] if said else "ended without a word"
+    errors = [line for line in lines if "what():" in line] or [line for line in lines if "Error" in line]
+    return " ".join(errors[-1].split())[:200] if errors else "ended without a message"

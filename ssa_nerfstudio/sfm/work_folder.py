@@ -1,4 +1,4 @@
-"""The folder in which a capture is worked on: it outlives a kill, and becomes the output only when complete."""
+"""The folder that intermediate results are kept in, so that an interrupted run can be continued."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from pathlib import Path
 from typing import Any
 
 from ssa_nerfstudio._system.file_lock import locked_folder
+from ssa_nerfstudio.data.writing import unwritable_as_input_error
 from ssa_nerfstudio.errors import InputError
 
 
-class Work:
-    """Folders of work beside the output, each kept for the next run as long as what it was made from stays the same."""
+class WorkFolder:
+    """A folder `.NAME.work` beside the output, with a subfolder for each intermediate result."""
 
     def __init__(self, output: Path) -> None:
-        """Take the output: the work is done in `.NAME.work` beside it."""
-        self.output = output
-        self.folder = output.parent / f".{output.name}.work"
-        self.kept = False
-        """Whether a refusal leaves the work for the next run."""
+        """Derive the folder's path from that of the output."""
+        self.path = output.parent / f".{output.name}.work"
+        self.keep_after_error = False
+        """Whether an `InputError` leaves the folder for the next run."""
 
-    def room(self, name: str, made_from: Any) -> Path:
-        """A folder, empty if it was made from something else or not at all.
+    def subfolder(self, name: str, inputs: Any) -> Path:
+        """Return a subfolder with what an earlier run made from the same inputs; empty where the inputs differ.
 
         Args:
-            name: of the folder.
-            made_from: what its contents follow from, JSON.
+            name: name of the subfolder.
+            inputs: all that its contents depend on, as JSON values.
         """
-        folder, record = self.folder / name, self.folder / f"{name}.json"
-        text = json.dumps(made_from, sort_keys=True)
+        folder, record = self.path / name, self.path / f"{name}.json"
+        text = json.dumps(inputs, sort_keys=True)
         if not record.is_file() or record.read_text(encoding="utf-8") != text:
             record.unlink(missing_ok=True)
             shutil.rmtree(folder, ignore_errors=True)
@@ -39,37 +39,36 @@ class Work:
             record.write_text(text, encoding="utf-8")
         return folder
 
-    def discard(self) -> None:
-        """Removes all work."""
-        shutil.rmtree(self.folder, ignore_errors=True)
+    def remove(self) -> None:
+        """Remove the folder."""
+        shutil.rmtree(self.path, ignore_errors=True)
 
 
 @contextmanager
-def resumable_work(output: Path) -> Iterator[Work]:
-    """Work towards `output`, alone; what a run leaves behind when it is killed, the next one finds.
+def resumable_work(output: Path) -> Iterator[WorkFolder]:
+    """Lock and yield the work folder of an output.
 
-    A refusal removes the work, unless it is marked as kept, or memory was all that lacked.
+    The folder stays when the process is killed or interrupted, when memory runs out, and after an `InputError` with
+    `keep_after_error`. Other errors remove it.
 
     Raises:
-        InputError: `output` exists or cannot be written, another process works towards it, or memory ran out.
+        InputError: `output` exists or cannot be written, another process works on it, or memory ran out.
     """
-    work = Work(output)
-    with locked_folder(work.folder, "ssa process"):
+    work = WorkFolder(output)
+    with locked_folder(work.path, "ssa process"), unwritable_as_input_error(output):
         try:
-            # Only now: another process may have completed it before it let go of the work.
+            # Checked under the lock: another process may have completed the output before it released the folder.
             if output.exists():
-                raise InputError(f"{output} exists already", "remove it or name another folder with --output")
+                raise InputError(f"{output} exists already", "remove it or choose another output folder")
             yield work
         except InputError:
-            if not work.kept:
-                work.discard()
+            if not work.keep_after_error:
+                work.remove()
             raise
         except KeyboardInterrupt as error:
-            raise KeyboardInterrupt(f"stopped; the same command continues from {work.folder}") from error
+            raise KeyboardInterrupt(f"stopped; the same command continues from {work.path}") from error
         except MemoryError as error:
-            raise InputError(f"{error}", f"the same command goes on from the work in {work.folder}") from error
-        except OSError as error:
-            work.discard()
-            raise InputError(
-                f"{output} cannot be written ({error})", "free space there or name another --output"
-            ) from error
+            raise InputError(f"{error}", f"the same command continues from the work in {work.path}") from error
+        except OSError:
+            work.remove()
+            raise

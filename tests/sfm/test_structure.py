@@ -12,7 +12,7 @@ from small_captures import HEIGHT, WIDTH, poses, write
 from benchmarks.alignment import center_errors, similarity
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.sfm.photos_to_dataset import process
-from ssa_nerfstudio.sfm.reconstruction import MODEL, Pass, Settings
+from ssa_nerfstudio.sfm.reconstruction import MODEL, Pass, SfmSettings
 
 VIEWS = 12
 
@@ -26,7 +26,7 @@ def test_features_and_matches_are_made_once(tmp_path, photos):
     import PIL.Image  # noqa: F401 - before pycolmap
     import pycolmap
 
-    from ssa_nerfstudio.sfm.colmap import Structure
+    from ssa_nerfstudio.sfm.colmap import StructureFromMotion
 
     images = write(tmp_path / "images", photos(VIEWS))
     names = sorted(path.name for path in images.iterdir())
@@ -47,7 +47,7 @@ def test_features_and_matches_are_made_once(tmp_path, photos):
     models = []
     for folder, stops in (("whole", ()), ("stopped", (("features", 4), ("matches", 60)))):
         (tmp_path / folder).mkdir()
-        structure = Structure(images, one_pass, tmp_path / folder, Settings(threads=1))
+        structure = StructureFromMotion(images, one_pass, tmp_path / folder, SfmSettings(threads=1))
         seen: list[tuple[str, int]] = []
         for stage, done in stops:
             with pytest.raises(Interrupted):  # noqa: PT012 - whichever of the two is interrupted
@@ -70,7 +70,7 @@ def test_mud_all_over_the_frame(tmp_path, draw_effect, photos):
     folder = write(tmp_path / "photos", [layers.apply(photo) for photo in photos(24)])
     true = poses(24)[:, :3, 3]
     source = read_source(folder, "frame", min_photos=3)
-    outcome = process([source], tmp_path / "out", settings=Settings(threads=1))
+    outcome = process([source], tmp_path / "out", settings=SfmSettings(threads=1))
     assert outcome.passes[0].count >= 0.9 * 24
     assert _error(tmp_path / "out", true) < 0.03
 

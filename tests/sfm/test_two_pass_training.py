@@ -16,7 +16,7 @@ from PIL import Image
 from small_captures import HEIGHT, WIDTH, write
 
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.sfm.photos_to_dataset import MASK
+from ssa_nerfstudio.sfm.nerfstudio_dataset import MASK
 
 BIN = Path(sys.executable).parent
 

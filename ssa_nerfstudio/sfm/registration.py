@@ -1,0 +1,76 @@
+"""How many photos of each pass structure from motion registered, and whether they are enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.sfm.ingest import Photo
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True)
+class PassRegistration:
+    """Registration of the photos of one pass."""
+
+    name: str
+    """Name of the pass."""
+    photos: int
+    """Number of photos in the pass."""
+    missing: tuple[str, ...]
+    """Sources of the photos that were not registered."""
+
+    @property
+    def count(self) -> int:
+        """Number of registered photos."""
+        return self.photos - len(self.missing)
+
+    @property
+    def share(self) -> float:
+        """Share of registered photos, in [0, 1]."""
+        return self.count / self.photos
+
+
+def registrations(
+    names: Sequence[str], photos: Sequence[Sequence[Photo]], model: pycolmap.Reconstruction | None
+) -> tuple[PassRegistration, ...]:
+    """Count the registered photos of every pass.
+
+    Args:
+        names: names of the passes.
+        photos: the photos of each.
+        model: the reconstruction, or None where there is none.
+    """
+    images = [] if model is None else [image for image in model.images.values() if image.has_pose]
+    registered = {image.name for image in images}
+    return tuple(
+        PassRegistration(name, len(each), tuple(photo.source for photo in each if photo.name not in registered))
+        for name, each in zip(names, photos, strict=True)
+    )
+
+
+def check_registrations(passes: Sequence[PassRegistration], min_share: float, masked: bool) -> None:
+    """Check that enough photos of every pass are registered.
+
+    Args:
+        passes: from `registrations`.
+        min_share: required share of the photos of each pass, in [0, 1]; at least one photo is needed.
+        masked: whether an artifact has been masked, so that a mask is no remedy.
+
+    Raises:
+        InputError: a pass has fewer.
+    """
+    for each in passes:
+        if each.share < min_share or each.count == 0:
+            remedy = "take photos that overlap more"
+            if not masked:
+                remedy = f"mask what covers part of every frame, or {remedy}"
+            raise InputError(
+                f"only {each.count} of {each.photos} {each.name} photos could be registered, {min_share:.0%} are "
+                "required",
+                remedy,
+            )
