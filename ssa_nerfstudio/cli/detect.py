@@ -38,8 +38,13 @@ class Command:
         from rich.console import Console
 
         from ssa_nerfstudio.data.writing import staged_folder, write_text
-        from ssa_nerfstudio.evidence.capture_detection import as_json, cameras_of, detect_camera, write_detections
-        from ssa_nerfstudio.evidence.detection import LEAST_VIEWS
+        from ssa_nerfstudio.evidence.capture_detection import (
+            detect_camera,
+            detections_to_json,
+            read_cameras,
+            write_detections,
+        )
+        from ssa_nerfstudio.evidence.detection import MIN_VIEWS
 
         for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
             if (value := getattr(self, name)) < lowest:
@@ -52,22 +57,22 @@ class Command:
             raise InputError(f"{self.output} exists already", "remove it or name another folder with --output")
         output = self.output or Path("outputs/detection") / self.data.resolve().stem
         console = Console(highlight=False, soft_wrap=True)
-        cameras = cameras_of(self.data, self.frames)
+        cameras = read_cameras(self.data, self.frames)
         found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
         if self.output is None:
             shutil.rmtree(output, ignore_errors=True)
         with staged_folder(output) as folder:
             write_detections(folder, found)
             if self.json is not None:
-                write_text(self.json, as_json(found))
+                write_text(self.json, detections_to_json(found))
         for name, detection in found.items():
             low, high = detection.p_interval
             camera = f"{name}: " if len(found) > 1 else ""
-            if detection.views < LEAST_VIEWS:
-                console.print(f"{camera}{detection.views} views are too few to tell; {LEAST_VIEWS} are needed")
+            if detection.views < MIN_VIEWS:
+                console.print(f"{camera}{detection.views} views are too few to tell; {MIN_VIEWS} are needed")
                 continue
             covered = f", {detection.coverage:.1%} of the frame" if detection.verdict != "none" else ""
-            covered = ", too few static edges to report" if detection.slight else covered
+            covered = ", too few static edges to report" if detection.too_few_edges else covered
             console.print(
                 f"{camera}{detection.verdict}{covered} ({detection.views} views, p = {detection.p_value:.3g}, "
                 f"false alarms [{low:.3f}, {high:.3f}])"

@@ -1,1 +1,1 @@
-"""What photos say about a static artifact: statistics, detection, initialization. Plain functions on arrays."""
+"""Evidence of a static artifact in photos: statistics, detection, initialization of an overlay."""

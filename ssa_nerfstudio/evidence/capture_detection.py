@@ -1,4 +1,4 @@
-"""Detection on photos as they lie on the disk: statistics and verdict of each camera, and the files that show them."""
+"""Detection on photos and videos on disk: the cameras of a capture, their detections, and the files that show them."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.data.sources import Source, read_source
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.detection import DRAWS, EVIDENCE_NEEDED, Detection, detect
+from ssa_nerfstudio.evidence.detection import DRAWS, Detection, detect
+from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.statistics import accumulate
 
 MIN_PHOTOS = 2
-"""What stays the same in all photos takes more than one to see."""
+"""With fewer photos of a camera, nothing can be called static."""
 
 
 @dataclass(frozen=True)
 class Camera:
-    """Photos of one camera."""
+    """The photos of one camera, as a stream."""
 
     name: str
-    """For messages and folders: camera-1, ..."""
+    """camera-1, ...; names its folder and its messages."""
     count: int
-    """How many there are, about."""
+    """Their number; approximate for videos."""
     photos: Callable[[int], Iterator[np.ndarray]]
-    """Decodes them in their order, so many at once: uint8 [H, W, 3]."""
+    """Decodes them in order, uint8 [H, W, 3] each; the argument is how many to decode at once."""
 
 
-def cameras_of(data: Path, frames: int) -> list[Camera]:
-    """The cameras of a nerfstudio dataset (its training photos), of a folder of photos or videos, or of one video.
+def read_cameras(data: Path, frames: int) -> list[Camera]:
+    """Find the cameras of a capture, without decoding its photos; poses are not read.
 
     Args:
-        data: where they are; poses are not needed and not read.
-        frames: to take from videos.
+        data: a nerfstudio dataset (its training photos), a folder of photos or videos, or one video.
+        frames: frames to take from videos.
 
     Raises:
-        InputError: nothing usable is there, or too few photos.
+        InputError: no usable photos, or too few of them.
     """
     if data.suffix == ".json" or (data / "transforms.json").is_file():
         return _of_dataset(Dataset.read(data, eval_interval=8), data)
@@ -62,13 +63,13 @@ def cameras_of(data: Path, frames: int) -> list[Camera]:
 
 
 def detect_camera(camera: Camera, threads: int, console: Console | None = None, draws: int = DRAWS) -> Detection:
-    """Decode a camera's photos once and test what they have in common; memory does not depend on their number.
+    """Decode a camera's photos once and test them; memory does not depend on their number.
 
     Args:
-        camera: whose photos.
+        camera: its photos.
         threads: photos decoded at once.
-        console: takes the progress bar.
-        draws: shifted captures to compare with.
+        console: for the progress bar; None for no bar.
+        draws: shifted captures in the null distribution.
 
     Raises:
         InputError: a photo cannot be decoded.
@@ -91,33 +92,33 @@ def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = 
         One detection per camera, by name: `camera-1`, ...
 
     Raises:
-        InputError: nothing usable is there, too few photos, or one that cannot be decoded.
+        InputError: no usable photos, too few of them, or one that cannot be decoded.
     """
     threads = threads or os.cpu_count() or 1
-    return {camera.name: detect_camera(camera, threads) for camera in cameras_of(Path(data), frames)}
+    return {camera.name: detect_camera(camera, threads) for camera in read_cameras(Path(data), frames)}
 
 
-def write_detections(folder: Path, found: dict[str, Detection]) -> None:
-    """Write evidence.png, mask_nerfstudio.png and mask_colmap.png, for several cameras in a folder each.
+def write_detections(folder: Path, detections: dict[str, Detection]) -> None:
+    """Write evidence.png, mask_nerfstudio.png and mask_colmap.png; several cameras get a folder each.
 
-    nerfstudio (mask_path) and COLMAP (camera_mask_path) both ignore black, so the two masks are the same: black where
-    the artifact is, white where the scene is, in the photos' raw frame. The names are there so that nobody has to ask.
+    The two masks are the same, in the photos' raw frame: black where the artifact is, white where the scene is.
+    nerfstudio (mask_path) and COLMAP (camera_mask_path) both ignore black.
 
     Args:
-        folder: an empty one.
-        found: by the camera's name.
+        folder: an existing, empty folder.
+        detections: by the camera's name.
     """
-    for name, detection in found.items():
-        target = folder / name if len(found) > 1 else folder
+    for name, detection in detections.items():
+        target = folder / name if len(detections) > 1 else folder
         target.mkdir(exist_ok=True)
-        Image.fromarray(_evidence_picture(detection)).save(target / "evidence.png")
+        Image.fromarray(_evidence_image(detection)).save(target / "evidence.png")
         mask = Image.fromarray((~detection.mask).numpy().astype(np.uint8) * 255)
         for file in ("mask_nerfstudio.png", "mask_colmap.png"):
             mask.save(target / file)
 
 
-def as_json(found: dict[str, Detection]) -> str:
-    """verdict, coverage, p_value, views and more of every camera."""
+def detections_to_json(detections: dict[str, Detection]) -> str:
+    """Serialize every camera's verdict, coverage, p-value, number of views, and shares of static edges."""
     groups = [
         {
             "name": name,
@@ -131,7 +132,7 @@ def as_json(found: dict[str, Detection]) -> str:
             "width": d.mask.shape[1],
             "height": d.mask.shape[0],
         }
-        for name, d in found.items()
+        for name, d in detections.items()
     ]
     return json.dumps({"groups": groups}, indent=2) + "\n"
 
@@ -147,7 +148,7 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
         if len(members) < MIN_PHOTOS:
             raise InputError(
                 f"{data}: {members[0].path} is the only photo of its camera",
-                f"what stays the same takes {MIN_PHOTOS} to see: add photos or take it out",
+                f"a static artifact takes at least {MIN_PHOTOS} to detect: add photos or remove this one",
             )
         cameras.append(Camera(f"camera-{group + 1}", len(members), partial(ordered_map, dataset.read_photo, members)))
     return cameras
@@ -158,8 +159,8 @@ def _frames(source: Source, frames: int) -> Iterator[np.ndarray]:
         yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
 
 
-def _evidence_picture(detection: Detection) -> np.ndarray:
-    """Evidence in colors, brightest at twice what is needed; uint8 [h, w, 3]."""
-    level = (detection.evidence.cpu().numpy() / (2 * EVIDENCE_NEEDED[0])).clip(0, 1)
+def _evidence_image(detection: Detection) -> np.ndarray:
+    """Evidence as a color map, brightest at twice the threshold: uint8 [h, w, 3]."""
+    level = (detection.evidence.cpu().numpy() / (2 * EVIDENCE_THRESHOLDS[0])).clip(0, 1)
     colored = cv2.applyColorMap((level * 255).astype(np.uint8), cv2.COLORMAP_INFERNO)
     return cv2.cvtColor(colored, cv2.COLOR_BGR2RGB)

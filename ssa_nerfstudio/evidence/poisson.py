@@ -1,4 +1,4 @@
-"""An image from its gradients: Poisson's equation, solved by a cosine transform."""
+"""Integration of gradients to an image: Poisson's equation, solved by a cosine transform."""
 
 from __future__ import annotations
 
@@ -7,24 +7,41 @@ import scipy.fft
 
 
 def divergence(across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """Of differences between neighbors: [h, w - 1] from left to right and [h - 1, w] downwards. [h, w]."""
+    """Divergence [h, w] of differences between neighbors.
+
+    Args:
+        across: from left to right, [h, w - 1].
+        down: from top to bottom, [h - 1, w].
+    """
     total = np.zeros((across.shape[0], down.shape[1]), np.result_type(across, down))
     add_divergence(total, across, down)
     return total
 
 
 def add_divergence(total: np.ndarray, across: np.ndarray, down: np.ndarray) -> None:
-    """Add it to rows [h + 1 or fewer, w], of which `across` and `down` are the first: images by bands of rows."""
+    """Add a divergence in place, for images that are processed in bands of rows.
+
+    Args:
+        total: rows of the sum from the band's first on, [at least n, w].
+        across: differences within the band's rows, [n, w - 1].
+        down: differences from the band's rows to the next ones, [n or n - 1, w].
+    """
     total[: len(across), :-1] += across
     total[: len(across), 1:] -= across
     total[: len(down)] += down
     total[1 : 1 + len(down)] -= down
 
 
-def integrated(divergence: np.ndarray) -> np.ndarray:
-    """The image [h, w] of mean 0 whose differences are nearest to those of a divergence, in least squares.
+def solve_poisson(divergence: np.ndarray) -> np.ndarray:
+    """Solve Poisson's equation: the image of mean 0 whose differences are nearest, in least squares, to the given ones.
 
-    Without flux through the border: the differences there are free.
+    Neumann boundary: no flux through the border.
+
+    Args:
+        divergence: of the differences, [h, w].
+
+    Returns:
+        [h, w].
     """
     height, width = divergence.shape
     spectrum = np.asarray(scipy.fft.dctn(divergence, norm="ortho"))

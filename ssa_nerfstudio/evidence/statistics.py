@@ -1,4 +1,4 @@
-"""What is the same in all views: per-pixel sums over a stream of images. Accumulates, decides nothing."""
+"""Per-pixel statistics over a stream of views."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from torch import Tensor
 from ssa_nerfstudio.evidence.brightness import BrightnessBlocks
 
 _FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
-_MOST_IN_INT32 = 33_000
-"""Views of uint8 whose squares add up to less than 2^31."""
+_MAX_VIEWS_IN_INT32 = 33_000
+"""So many squares of uint8 add up to less than 2^31."""
 
 
 class ImageStatistics:
-    """Per-pixel mean and standard deviation of images of one size; memory does not depend on how many there are.
+    """Per-pixel mean and standard deviation of images of one size; memory does not depend on their number.
 
-    Integer images are summed in int64 (uint8 in int32 for as long as that holds them), which is exact; in float32,
+    Integer images are summed in int64 (uint8 in int32 while it suffices), which is exact; in float32,
     E[x^2] - E[x]^2 would cancel at the deviations of 0.05 that matter here. Floating-point images are summed in
-    float64. The same pass keeps the brightness of blocks of neighboring views, on which detection is built.
+    float64. The same pass accumulates the brightness of blocks of neighboring views for detection.
     """
 
     brightness: BrightnessBlocks
-    """Views in the order in which they came."""
+    """Of the views in the order of their addition."""
 
     def __init__(self) -> None:
         self._sum: Tensor | None = None
@@ -34,21 +34,21 @@ class ImageStatistics:
         self._dtype: torch.dtype
 
     def add(self, image: Tensor, mask: Tensor | None = None) -> None:
-        """Take one view.
+        """Add one view.
 
         Args:
             image: [H, W, 3 or more], uint8 or uint16 in full range, or float in [0, 1]; channels beyond 3 are ignored.
             mask: [H, W] or [H, W, 1]; only pixels where it is True (or not 0) count. None: all.
 
         Raises:
-            ValueError: where size or dtype differ from the views before.
+            ValueError: the size or dtype differs from that of the earlier views.
         """
         image = image[..., :3]
         if self._sum is None:
             exact = image.dtype in _FULL_SCALE
             self._dtype = image.dtype
             self._scale = _FULL_SCALE.get(image.dtype, 1.0)
-            # int32 is half the memory traffic of int64, and is left for it when it gets full.
+            # int32 halves the memory traffic until its sums could overflow.
             kind = torch.int32 if image.dtype == torch.uint8 else torch.int64 if exact else torch.float64
             self._sum = torch.zeros(image.shape, dtype=kind, device=image.device)
             self._squares = torch.zeros_like(self._sum)
@@ -66,7 +66,7 @@ class ImageStatistics:
             seen = (mask.reshape(*image.shape[:2], 1) != 0).to(image.device)
             self._views += seen
             values = torch.where(seen, values, torch.zeros_like(values))
-        if self._sum.dtype == torch.int32 and self._added == _MOST_IN_INT32:
+        if self._sum.dtype == torch.int32 and self._added == _MAX_VIEWS_IN_INT32:
             self._sum, self._squares = self._sum.long(), self._squares.long()
         self._added += 1
         self._sum += values
@@ -86,12 +86,12 @@ class ImageStatistics:
 
     @property
     def scale(self) -> float:
-        """What white is in the images: 255, 65535 or 1."""
+        """Value of white in the images: 255, 65535 or 1."""
         return self._scale
 
     @property
     def views(self) -> Tensor:
-        """How many views showed each pixel: [H, W, 1] int64."""
+        """Number of views that show each pixel: [H, W, 1] int64."""
         _ = self.size
         return self._views
 
@@ -104,7 +104,7 @@ class ImageStatistics:
     def deviation(self) -> Tensor:
         """Largest standard deviation (of the population) among the channels: [H, W, 1] float64 in [0, 0.5].
 
-        1, more than any pixel can have, below two views: such a pixel does not show what is the same in all of them.
+        With fewer than two views it is 1, more than any pixel can have: nothing is known to be static there.
         """
         views = self.views
         total = self._total()
@@ -120,7 +120,7 @@ class ImageStatistics:
 
 
 def accumulate(views: Iterable[tuple[Tensor, Tensor | None]]) -> ImageStatistics:
-    """Statistics of a stream of (image, mask or None). See `ImageStatistics.add`."""
+    """Accumulate a stream of (image, mask or None); see `ImageStatistics.add`."""
     statistics = ImageStatistics()
     for image, mask in views:
         statistics.add(image, mask)

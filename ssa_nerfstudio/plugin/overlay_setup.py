@@ -11,7 +11,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from rich.progress import track
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.detection import LEAST_VIEWS, Detection, detect, static_area
+from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect, static_area
 from ssa_nerfstudio.evidence.initialization import initialize
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
@@ -101,8 +101,8 @@ def _report(detection: Detection, name: str) -> None:
             "with an overlay. (--pipeline.model.overlay off trains without.)"
         )
         return
-    reason = "too few to tell" if detection.views < LEAST_VIEWS else f"p = {detection.p_value:.2g}"
-    reason += ", too few static edges to report" if detection.slight else ""
+    reason = "too few to tell" if detection.views < MIN_VIEWS else f"p = {detection.p_value:.2g}"
+    reason += ", too few static edges to report" if detection.too_few_edges else ""
     CONSOLE.print(
         f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"

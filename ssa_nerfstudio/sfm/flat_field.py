@@ -18,7 +18,7 @@ import PIL.Image
 
 from ssa_nerfstudio.data.photos import load_photo, read_gray
 from ssa_nerfstudio.data.writing import staged_file
-from ssa_nerfstudio.evidence.poisson import add_divergence, integrated
+from ssa_nerfstudio.evidence.poisson import add_divergence, solve_poisson
 
 MIN_PHOTOS = 8
 """With fewer photos, static structure cannot be told from scene structure at the same place."""
@@ -65,7 +65,7 @@ def static_factor(photos: Sequence[Path], max_size: int) -> np.ndarray | None:
         add_divergence(divergence[top:], across, down)
     if certain < _MIN_SHARE * 2 * height * width:
         return None
-    factor = integrated(divergence)
+    factor = solve_poisson(divergence)
     return factor - cv2.GaussianBlur(factor, (0, 0), min(height, width) / _COARSE_SCALE)
 
 

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.evidence.additive_light import LEAST_EDGES, adds_light
+from ssa_nerfstudio.evidence.additive_light import MIN_EDGES, adds_light
 from ssa_nerfstudio.evidence.detection import static_area
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 
@@ -95,5 +95,5 @@ def test_the_answer_depends_neither_on_exposure_nor_on_orientation(seed: int, ga
 
 def test_too_few_edges_tell_nothing() -> None:
     edges = np.zeros((20, 30), bool)
-    edges.flat[: LEAST_EDGES - 1] = True
+    edges.flat[: MIN_EDGES - 1] = True
     assert not adds_light(np.eye(20, 30), np.ones((20, 30)), edges)

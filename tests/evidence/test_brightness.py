@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.evidence.brightness import MOST_BLOCKS, WORKING_SIZE, BrightnessBlocks
+from ssa_nerfstudio.evidence.brightness import MAX_BLOCKS, WORKING_SIZE, BrightnessBlocks
 
 
 def noise(views: int, height: int, width: int) -> torch.Tensor:
@@ -25,12 +25,12 @@ def test_blocks_hold_neighboring_views_and_all_of_equal_number(views):
         blocks.add(image, None)
     means, seen = blocks.means()
     size = 1
-    while size * MOST_BLOCKS < views:
+    while size * MAX_BLOCKS < views:
         size *= 2
     expected = [chunk.double().mean(dim=(0, 3)) for chunk in images.split(size)]
     if len(expected) > 2 and len(images.split(size)[-1]) < size / 2:
         expected.pop()
-    assert len(means) == len(expected) <= MOST_BLOCKS
+    assert len(means) == len(expected) <= MAX_BLOCKS
     torch.testing.assert_close(means, torch.stack(expected))
     assert seen.all()
 
@@ -72,6 +72,6 @@ def test_memory_does_not_grow_with_the_number_of_views():
     for _ in range(1000):
         blocks.add(image, None)
     held = sum(value.numel() for value in vars(blocks).values() if isinstance(value, torch.Tensor))
-    assert held == 2 * MOST_BLOCKS * 16
+    assert held == 2 * MAX_BLOCKS * 16
     means, _ = blocks.means()
     torch.testing.assert_close(means, image.double().mean(dim=-1).expand_as(means))

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.evidence.edge_estimate import REACH, estimate, opaque, textured
+from ssa_nerfstudio.evidence.edge_estimate import MAX_DISTANCE, estimate_layers, opaque_areas, textured_areas
 
 HEIGHT, WIDTH = 96, 128
 
@@ -33,7 +33,7 @@ def test_matte_and_difference_of_a_logo_come_from_its_outline(alpha: float) -> N
     """The unknown scene behind varies slowly: the estimate keeps half of the logo, and drops the scene."""
     matte = alpha * logo()
     mean, deviation, edges = seen(matte, color=1.0)
-    found = estimate(mean, deviation, edges, 0 * edges)
+    found = estimate_layers(mean, deviation, edges, 0 * edges)
     clean = seen(0 * matte, color=1.0)[0]
     inside, outside = logo() & (edges == 0), ~logo() & (edges == 0)
     assert 0.4 * alpha < np.median(found.matte[inside]) < 1.05 * alpha
@@ -47,7 +47,7 @@ def test_what_stays_in_place_without_static_edges_is_nothing() -> None:
     """A sky above a skyline: mean and deviation have a border there, but no static edge."""
     mean, deviation, edges = seen(0.4 * logo(), color=1.0)
     mean[:, :10], deviation[:10] = 0.9, 0.001
-    found = estimate(mean, deviation, edges, 0 * edges)
+    found = estimate_layers(mean, deviation, edges, 0 * edges)
     assert not found.matte[:9].any()
     assert not found.difference[:, :9].any()
 
@@ -60,10 +60,10 @@ def test_opaque_is_where_the_deviation_rises_at_the_border() -> None:
     deviation[70:] = 0.002
     soft = cv2.GaussianBlur(path.astype(float), (0, 0), 8)
     deviation *= 1 - 0.95 * soft
-    found = opaque(board | path, deviation)
+    found = opaque_areas(board | path, deviation)
     assert found[70:].all()
     assert not found[:60].any()
-    assert opaque(np.ones_like(board), 0 * deviation).all(), "of a frame without a border there is nothing else to say"
+    assert opaque_areas(np.ones_like(board), 0 * deviation).all(), "an area without surroundings counts as opaque"
 
 
 def test_an_opaque_board_leaks_nothing_through_a_gap_in_its_outline() -> None:
@@ -71,8 +71,8 @@ def test_an_opaque_board_leaks_nothing_through_a_gap_in_its_outline() -> None:
     matte[70:] = 1
     mean, deviation, edges = seen(matte, color=0.1)
     edges[:, 50:60] = 0
-    assert estimate(mean, deviation, edges, 0 * edges).matte[:60].any()
-    found = estimate(mean, deviation, edges, opaque((matte > 0).astype(np.uint8), deviation))
+    assert estimate_layers(mean, deviation, edges, 0 * edges).matte[:60].any()
+    found = estimate_layers(mean, deviation, edges, opaque_areas((matte > 0).astype(np.uint8), deviation))
     assert not found.matte.any()
     assert not found.difference.any()
 
@@ -83,14 +83,14 @@ def test_any_frame_gives_finite_layers_of_its_size(height: int, width: int, seed
     rng = np.random.default_rng(seed)
     mean, deviation = rng.random((3, height, width)), 0.5 * rng.random((height, width))
     edges = (rng.random((height, width)) < 0.2).astype(np.uint8)
-    found = estimate(mean, deviation, edges, 0 * edges)
+    found = estimate_layers(mean, deviation, edges, 0 * edges)
     assert found.matte.shape == (height, width)
     assert found.difference.shape == (3, height, width)
     assert np.isfinite(found.difference).all()
     assert found.matte.min() >= 0
     assert found.matte.max() <= 1
-    assert opaque(edges, deviation).shape == (height, width)
-    empty = estimate(mean, deviation, 0 * edges, edges)
+    assert opaque_areas(edges, deviation).shape == (height, width)
+    empty = estimate_layers(mean, deviation, 0 * edges, edges)
     assert not empty.matte.any()
     assert not empty.difference.any()
 
@@ -105,9 +105,9 @@ def test_far_from_edges_the_estimate_is_nothing_though_it_leaks() -> None:
     )
     edges = np.pad(edges, ((0, 0), (0, wide)))
     edges[:, 70:] = 0
-    found = estimate(mean, deviation, edges, 0 * edges)
-    assert not found.matte[:, 70 + REACH + 2 :].any()
-    assert not found.difference[:, :, 70 + REACH + 2 :].any()
+    found = estimate_layers(mean, deviation, edges, 0 * edges)
+    assert not found.matte[:, 70 + MAX_DISTANCE + 2 :].any()
+    assert not found.difference[:, :, 70 + MAX_DISTANCE + 2 :].any()
     assert found.matte[:, :70].any()
 
 
@@ -118,6 +118,6 @@ def test_a_calm_area_with_a_texture_of_its_own_is_told_from_one_that_changes() -
     edges[80:], edges[:20] = rng.random((16, WIDTH)) < 0.4, rng.random((20, WIDTH)) < 0.4
     deviation = np.full((HEIGHT, WIDTH), 0.2)
     deviation[78:] = 0.05
-    found = textured(edges, deviation)
+    found = textured_areas(edges, deviation)
     assert found[82:].mean() > 0.95
     assert not found[:70].any()

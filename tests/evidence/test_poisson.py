@@ -5,14 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.evidence.poisson import add_divergence, divergence, integrated
+from ssa_nerfstudio.evidence.poisson import add_divergence, divergence, solve_poisson
 
 
 @settings(max_examples=25, deadline=None)
 @given(height=st.integers(1, 40), width=st.integers(1, 40))
 def test_an_image_comes_back_from_its_gradients_up_to_its_mean(height: int, width: int) -> None:
     image = np.random.default_rng(height * 41 + width).random((height, width))
-    found = integrated(divergence(np.diff(image, axis=1), np.diff(image, axis=0)))
+    found = solve_poisson(divergence(np.diff(image, axis=1), np.diff(image, axis=0)))
     np.testing.assert_allclose(found, image - image.mean(), atol=1e-9)
 
 
@@ -32,7 +32,7 @@ def test_gradients_of_no_image_are_fitted_in_least_squares() -> None:
                     rows.append((row.ravel(), value))
     matrix, values = np.array([row for row, _ in rows]), np.array([value for _, value in rows])
     expected = np.linalg.lstsq(matrix, values, rcond=None)[0].reshape(5, 6)
-    np.testing.assert_allclose(integrated(divergence(across, down)), expected - expected.mean(), atol=1e-9)
+    np.testing.assert_allclose(solve_poisson(divergence(across, down)), expected - expected.mean(), atol=1e-9)
 
 
 @pytest.mark.parametrize("band", [1, 3, 7])

@@ -1,0 +1,64 @@
+"""The null distribution of static edges: the capture itself with its blocks of views shifted at random.
+
+Shifts by a few pixels keep what chance and habit bring about (a horizon at the same height, an object always in the
+middle, vignetting) and lose only what stays in place to the pixel. docs/detect.md derives it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+from scipy.special import betaincinv
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence, edge_shares, evidence_field
+
+MAX_SHIFT = 16
+"""Blocks are shifted by up to this many working pixels in each direction, in steps of COARSE_FACTOR."""
+
+
+def null_shares(evidence: EdgeEvidence, draws: int, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
+    """Draw shares of static edges after every block was shifted at random, by the same way at both scales.
+
+    Moving edges are left out where the capture itself has them. That removes more of the capture's edges than of a
+    shifted one's: p-values err upwards.
+
+    Args:
+        evidence: of the capture.
+        draws: how many shifted captures.
+        rng: of the shifts.
+
+    Yields:
+        `edge_shares` of a shifted capture.
+    """
+    moments = evidence.moments
+    reach = MAX_SHIFT // COARSE_FACTOR
+    steps = COARSE_FACTOR, 1
+    padded_moments = [_wrap_pad(at_scale, reach * step) for at_scale, step in zip(moments, steps, strict=True)]
+    for _ in range(draws):
+        shifts = rng.integers(0, 2 * reach + 1, (len(moments[0]), 2)).tolist()
+        fields = []
+        for at_scale, padded, step in zip(moments, padded_moments, steps, strict=True):
+            h, w = at_scale.shape[2:]
+            sums = torch.zeros_like(at_scale[0])
+            for block, (y, x) in zip(padded, shifts, strict=True):
+                sums += block[:, y * step : y * step + h, x * step : x * step + w]
+            fields.append(evidence_field(sums, len(at_scale)))
+        yield edge_shares(fields, evidence.still)
+
+
+def clopper_pearson(successes: int, trials: int) -> tuple[float, float]:
+    """95 % confidence interval of a binomial rate (Clopper and Pearson 1934)."""
+    low = 0.0 if successes == 0 else float(betaincinv(successes, trials - successes + 1, 0.025))
+    high = 1.0 if successes == trials else float(betaincinv(successes + 1, trials - successes, 0.975))
+    return low, high
+
+
+def _wrap_pad(moments: Tensor, margin: int) -> Tensor:
+    """Pad on all sides as if the frame were a torus, however small it is."""
+    h, w = moments.shape[2:]
+    rows = torch.arange(-margin, h + margin, device=moments.device) % h
+    columns = torch.arange(-margin, w + margin, device=moments.device) % w
+    return moments[:, :, rows][:, :, :, columns]
