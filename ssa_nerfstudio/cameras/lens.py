@@ -1,4 +1,4 @@
-"""Raw frame and undistorted frame: the warp, the crop and the intrinsics with which nerfstudio prepares photos."""
+"""Lenses: nerfstudio's undistortion of photos (warp, crop, intrinsics) and its inverse."""
 
 from __future__ import annotations
 
@@ -9,13 +9,15 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from ssa_nerfstudio.errors import InputError
+
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics of one camera as nerfstudio's transforms.json states them; (0, 0) is a corner of the corner pixel.
+    """Intrinsics of one camera as in nerfstudio's transforms.json; (0, 0) is the outer corner of the first pixel.
 
     Raises:
-        ValueError: the size is not positive, a value is not finite, or nerfstudio cannot undistort such a lens.
+        InputError: the size is not positive, a value is not finite, or nerfstudio cannot undistort such a lens.
     """
 
     width: int
@@ -31,31 +33,31 @@ class Lens:
     cy: float
     """Principal point, pixels from the upper edge."""
     distortion: tuple[float, ...] = (0.0,) * 6
-    """k1, k2, k3, k4, p1, p2; a perspective camera has no k4, a fisheye uses k1 to k4."""
+    """k1, k2, k3, k4, p1, p2; a perspective camera has k4 = 0, a fisheye uses k1 to k4."""
     model: Literal["perspective", "fisheye"] = "perspective"
     """OpenCV's pinhole model (transforms.json: OPENCV and simpler ones) or its fisheye (OPENCV_FISHEYE)."""
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise ValueError(f"frame must be at least 1 x 1 pixels, got {self.width} x {self.height}")
+            raise InputError(f"frame must be at least 1 x 1 pixels, got {self.width} x {self.height}")
         if not np.isfinite([self.fx, self.fy, self.cx, self.cy, *self.distortion]).all():
-            raise ValueError("intrinsics must be finite")
+            raise InputError("intrinsics must be finite")
         if len(self.distortion) != 6:
-            raise ValueError(f"distortion must be k1, k2, k3, k4, p1, p2, got {len(self.distortion)} values")
+            raise InputError(f"distortion must be k1, k2, k3, k4, p1, p2, got {len(self.distortion)} values")
         if self.model == "perspective" and self.distortion[3] != 0:
-            raise ValueError(f"nerfstudio undistorts no perspective camera with k4, got {self.distortion[3]}")
+            raise InputError(f"nerfstudio undistorts no perspective camera with k4, got {self.distortion[3]}")
 
     @property
     def distorted(self) -> bool:
-        """Whether nerfstudio warps photos of this lens at all."""
-        # In float32, as nerfstudio holds them.
+        """Whether nerfstudio undistorts photos of this lens."""
+        # In float32, as nerfstudio stores them.
         return bool(np.any(np.asarray(self.distortion, dtype=np.float32)))
 
     @property
     def matrix(self) -> np.ndarray:
-        """K [3, 3] float32 in OpenCV's convention, where (0, 0) is the center of the corner pixel."""
+        """K [3, 3] float32 in OpenCV's convention, where (0, 0) is the center of the first pixel."""
         matrix = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]], dtype=np.float32)
-        # In float32 as nerfstudio does it, so that the crop comes out the same to the pixel.
+        # In float32 like nerfstudio, so that the crop is the same to the pixel.
         matrix[:2, 2] = matrix[:2, 2] - 0.5
         return matrix
 
@@ -66,8 +68,8 @@ class Lens:
         return np.array([k1, k2, k3, k4] if self.model == "fisheye" else [k1, k2, p1, p2, k3, k4, 0, 0])
 
 
-def undistorted(lens: Lens) -> Lens:
-    """The camera after undistortion and crop, as nerfstudio 1.1.5 computes it (`_undistort_image`).
+def undistorted_lens(lens: Lens) -> Lens:
+    """The lens of the undistorted and cropped frame, as nerfstudio 1.1.5 computes it (`_undistort_image`).
 
     Perspective: `cv2.getOptimalNewCameraMatrix` with alpha 0, cropped to its region of interest. Fisheye:
     `cv2.fisheye.estimateNewCameraMatrixForUndistortRectify` with balance 0, not cropped.
@@ -76,19 +78,19 @@ def undistorted(lens: Lens) -> Lens:
 
 
 def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
-    """A picture of the raw frame, in the undistorted frame.
+    """Warp an image from the raw to the undistorted frame, bilinearly, as nerfstudio warps photos.
 
-    Bilinear, as nerfstudio warps photos. T and B = A W of an artifact are warped each for itself (premultiplied);
-    their straight color must not be. Where the lens has no distortion the picture is returned as it is.
+    Warp an artifact's T and B = A W, not its straight color. Without distortion the image itself is returned.
 
     Args:
         image: uint8 or float32 [H, W, C] or [H, W] of the lens' size.
+        lens: the raw frame's lens.
 
     Returns:
-        [H', W', C] or [H', W'] of `undistorted(lens)`'s size; 0 outside the raw frame, where photos are black too.
+        [H', W', C] or [H', W'] of `undistorted_lens(lens)`'s size; 0 outside the raw frame, where photos are black too.
 
     Raises:
-        ValueError: the image is not of the lens' size.
+        InputError: the image is not of the lens' size.
     """
     _check_size(image, lens)
     if not lens.distorted:
@@ -104,18 +106,18 @@ def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
 
 
 def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
-    """A picture of the undistorted frame, in the raw frame: the inverse of `undistort`, bilinear.
+    """Warp an image from the undistorted to the raw frame, bilinearly: the inverse of `undistort`.
 
     Args:
-        image: uint8 or float32 [H', W', C] or [H', W'] of `undistorted(lens)`'s size.
+        image: uint8 or float32 [H', W', C] or [H', W'] of `undistorted_lens(lens)`'s size.
         lens: the raw frame's lens.
-        fill: value where the crop left nothing to show: 1 for T and 0 for B leaves the photo there as it is.
+        fill: value outside the undistorted frame: 1 for T and 0 for B keep the photo there.
 
     Returns:
-        [H, W, C] or [H, W], as the image, of the lens' size.
+        [H, W, C] or [H, W], like the image, of the lens' size.
 
     Raises:
-        ValueError: the image is not of the undistorted size.
+        InputError: the image is not of the undistorted size.
     """
     if not lens.distorted:
         _check_size(image, lens)
@@ -129,9 +131,9 @@ def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
     else:
         precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
         rays = cv2.undistortPointsIter(pixels, lens.matrix, lens.coefficients, np.eye(3), matrix, precise)
-    places = (rays.reshape(lens.height, lens.width, 2) - (x, y)).astype(np.float32)
+    positions = (rays.reshape(lens.height, lens.width, 2) - (x, y)).astype(np.float32)
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (fill,) * 4}
-    warped = cv2.remap(image, places, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
+    warped = cv2.remap(image, positions, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
     return _with_channels(warped, image)
 
 
@@ -150,10 +152,10 @@ def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
             lens.matrix, lens.coefficients, (width, height), 0
         )
     if width < 1 or height < 1:
-        raise ValueError(f"undistorting with {lens.distortion} leaves no pixel of {lens.width} x {lens.height}")
+        raise InputError(f"undistorting with {lens.distortion} leaves no pixel of {lens.width} x {lens.height}")
     if not np.isfinite(matrix).all():
-        # A fisheye whose angle turns back within the frame: OpenCV answers with NaN.
-        raise ValueError(f"a lens with distortion {lens.distortion} folds its frame and cannot be undistorted")
+        # OpenCV returns NaN for a fisheye whose angle is not monotonic within the frame.
+        raise InputError(f"a lens with distortion {lens.distortion} folds its frame and cannot be undistorted")
     target = Lens(
         width=width,
         height=height,
@@ -166,10 +168,10 @@ def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
 
 
 def _with_channels(warped: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """OpenCV drops the last dimension of [H, W, 1]: give it back, as the image has it."""
+    """Restore the last dimension of [H, W, 1], which OpenCV drops."""
     return warped.reshape(*warped.shape[:2], *image.shape[2:])
 
 
 def _check_size(image: np.ndarray, lens: Lens) -> None:
     if image.shape[:2] != (lens.height, lens.width):
-        raise ValueError(f"image is {image.shape[1]} x {image.shape[0]}, the lens' frame {lens.width} x {lens.height}")
+        raise InputError(f"image is {image.shape[1]} x {image.shape[0]}, the lens' frame {lens.width} x {lens.height}")

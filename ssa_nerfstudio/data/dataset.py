@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ssa_nerfstudio.cameras.lens import Lens, undistorted
+from ssa_nerfstudio.cameras.lens import Lens, undistorted_lens
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.data.transforms import FILE_KEYS, SPLITS, Kind, Transforms
 from ssa_nerfstudio.errors import InputError
@@ -148,7 +148,7 @@ class Dataset:
     def _check(self) -> None:
         for frame in self.transforms.frames:
             try:
-                undistorted(self.transforms.lens(frame, self.downscale_factor))
+                undistorted_lens(self.transforms.lens(frame, self.downscale_factor))
             except ValueError as error:
                 raise InputError(
                     f"{self.transforms.path}: camera of {frame['file_path']}: {error}", "process the photos again"

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.ndimage
 import torch
 
-from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted_lens
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.checkpoint import Checkpoint
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
@@ -109,7 +109,7 @@ def raw_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
     for layers, row in zip(undistorted_layers(checkpoint), described, strict=True):
         try:
             lens = lens_of(row)
-            target = undistorted(lens)
+            target = undistorted_lens(lens)
         except ValueError as error:
             raise InputError(f"{checkpoint.path}: {error}", "leave out --raw-frame") from error
         if (target.width, target.height) != (layers.camera.width, layers.camera.height):

@@ -15,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import _undistort_image
 from PIL import Image
 
-from ssa_nerfstudio.cameras.lens import Lens, distort, undistort, undistorted
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistort, undistorted_lens
 
 GOPRO_LIKE = Lens(212, 120, 110.0, 103.0, 106.0, 60.0, (-0.18, 0.024, 0, 0, 0.0005, 0.0008))
 
@@ -41,7 +41,7 @@ def check_against_nerfstudio(image: np.ndarray, lens: Lens) -> None:
         with pytest.raises(ValueError, match=r"folds its frame|leaves no pixel"):
             undistort(image, lens)
         return
-    ours, target = undistort(image, lens), undistorted(lens)
+    ours, target = undistort(image, lens), undistorted_lens(lens)
     assert np.array_equal(ours, warped)
     assert ours.shape[:2] == (target.height, target.width)
     stated = (target.fx, target.fy, target.cx, target.cy)
@@ -56,7 +56,7 @@ def gopro_walk(captures: Path) -> tuple[np.ndarray, Lens]:
     return np.asarray(Image.open(captures / "gopro_walk" / meta["frames"][0]["file_path"])), lens
 
 
-def test_real_photos_come_out_as_nerfstudio_undistorts_them(captures):
+def test_real_photos_are_undistorted_as_by_nerfstudio(captures):
     photo, lens = gopro_walk(captures)
     check_against_nerfstudio(photo, lens)
     check_against_nerfstudio(photo.astype(np.float32) / 255, lens)
@@ -70,7 +70,7 @@ def test_real_photos_come_out_as_nerfstudio_undistorts_them(captures):
     coefficients=st.tuples(*[st.floats(-0.2, 0.2)] * 2, *[st.floats(-0.01, 0.01)] * 2),
     fisheye=st.booleans(),
 )
-def test_any_lens_comes_out_as_in_nerfstudio(size, focal, center, coefficients, fisheye):
+def test_any_lens_undistorts_as_in_nerfstudio(size, focal, center, coefficients, fisheye):
     k1, k2, p1, p2 = coefficients
     (width, height), (x, y) = size, center
     middle = (width / 2 + x, height / 2 + y)
@@ -86,13 +86,13 @@ def test_any_lens_comes_out_as_in_nerfstudio(size, focal, center, coefficients, 
 def test_a_fisheye_that_folds_its_frame_is_refused():
     lens = Lens(30, 30, 15.0, 14.55, 15.0, 15.0, (0.0, -0.125, 0.0, 0.0, 0.0, 0.0), "fisheye")
     with pytest.raises(ValueError, match="folds its frame"):
-        undistorted(lens)
+        undistorted_lens(lens)
 
 
-def test_without_distortion_nothing_is_touched():
+def test_without_distortion_the_image_is_returned():
     lens = Lens(20, 10, 30, 30, 9, 4)
     image = np.random.default_rng(0).random((10, 20, 3), dtype=np.float32)
-    assert undistorted(lens) == lens
+    assert undistorted_lens(lens) == lens
     assert undistort(image, lens) is image
     assert distort(image, lens, fill=0.0) is image
 
@@ -113,7 +113,7 @@ def test_distort_is_the_inverse_of_undistort(model):
 @pytest.mark.parametrize("model", ["perspective", "fisheye"])
 def test_both_warps_keep_the_channels(channels, model):
     lens = Lens(53, 30, 28.0, 26.0, 26.0, 15.0, (-0.1, 0.01, 0, 0, 0, 0), model)
-    target = undistorted(lens)
+    target = undistorted_lens(lens)
     raw = np.random.default_rng(0).random((30, 53, *channels), dtype=np.float32)
     straight = undistort(raw, lens)
     assert straight.shape == (target.height, target.width, *channels)
@@ -121,14 +121,14 @@ def test_both_warps_keep_the_channels(channels, model):
 
 
 def test_a_cropped_corner_is_filled():
-    target = undistorted(GOPRO_LIKE)
+    target = undistorted_lens(GOPRO_LIKE)
     ones = np.ones((target.height, target.width, 3), np.float32)
     raw = distort(ones, GOPRO_LIKE, fill=0.5)
     assert raw[60, 106] == pytest.approx([1, 1, 1])
     assert raw[0, 0] == pytest.approx([0.5, 0.5, 0.5])
 
 
-def test_straight_color_must_not_be_warped():
+def test_premultiplied_layers_warp_correctly_and_straight_color_does_not():
     """Why the layers are premultiplied: a white disc on black ground keeps its edge white."""
     y, x = np.mgrid[:120, :212]
     matte = (np.hypot(x - 40, y - 40) < 20).astype(np.float32)[..., None]
@@ -148,13 +148,13 @@ def test_straight_color_must_not_be_warped():
         ({"distortion": (0.1, 0, 0, 0.2, 0, 0)}, "no perspective camera with k4"),
     ],
 )
-def test_lenses_that_cannot_be_are_refused(fields, message):
+def test_invalid_lenses_are_refused(fields, message):
     stated = {"width": 20, "height": 10, "fx": 30.0, "fy": 30.0, "cx": 9.0, "cy": 4.0} | fields
     with pytest.raises(ValueError, match=message):
         Lens(**stated)
 
 
-def test_pictures_of_another_size_are_refused():
+def test_images_of_another_size_are_refused():
     with pytest.raises(ValueError, match="image is 5 x 4, the lens' frame 212 x 120"):
         undistort(np.zeros((4, 5, 3), np.uint8), GOPRO_LIKE)
     with pytest.raises(ValueError, match="image is 212 x 120, the lens' frame"):

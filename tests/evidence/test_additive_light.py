@@ -36,7 +36,7 @@ def statistics_of(photos: np.ndarray) -> ImageStatistics:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(("transmitted", "added"), [(0.3, 0.1), (0.5, 0.3), (0.6, 0.0), (0.2, 0.7)])
-def test_what_lowers_the_deviation_behind_it_hides(transmitted: float, added: float, seed: int) -> None:
+def test_an_artifact_that_lowers_the_deviation_hides(transmitted: float, added: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     photos, matte = scene(rng), drops(rng)
     area = static_area(statistics_of((1 - matte * (1 - transmitted)) * photos + matte * added))
@@ -46,7 +46,7 @@ def test_what_lowers_the_deviation_behind_it_hides(transmitted: float, added: fl
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("strength", [0.1, 0.2, 0.3])
-def test_what_leaves_the_deviation_as_it_is_only_adds(strength: float, seed: int) -> None:
+def test_an_artifact_that_keeps_the_deviation_adds_light(strength: float, seed: int) -> None:
     rng = np.random.default_rng(seed)
     photos, light = scene(rng), drops(rng)
     area = static_area(statistics_of(photos + strength * light * np.array([1.0, 0.9, 0.7])))
@@ -63,7 +63,7 @@ def test_an_opaque_board_hides_although_the_deviation_on_it_has_no_edges() -> No
     assert not area.adds_light
 
 
-def test_a_board_and_light_are_taken_together_as_light() -> None:
+def test_a_board_together_with_light_counts_as_light() -> None:
     """A layer that adds light can hide, too: with it both can be learned."""
     rng = np.random.default_rng(1)
     photos = scene(rng) + 0.3 * drops(rng)
@@ -71,7 +71,7 @@ def test_a_board_and_light_are_taken_together_as_light() -> None:
     assert static_area(statistics_of(photos)).adds_light
 
 
-def test_near_is_what_surrounds_static_edges_and_far_is_the_rest() -> None:
+def test_near_pixels_surround_static_edges() -> None:
     photos = scene(np.random.default_rng(2))
     photos[:, 80:, :40] = 0.1
     area = static_area(statistics_of(photos))
@@ -83,7 +83,7 @@ def test_near_is_what_surrounds_static_edges_and_far_is_the_rest() -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000), gain=st.floats(0.05, 1.0), turns=st.integers(0, 3))
-def test_the_answer_depends_neither_on_exposure_nor_on_orientation(seed: int, gain: float, turns: int) -> None:
+def test_the_result_depends_neither_on_exposure_nor_on_orientation(seed: int, gain: float, turns: int) -> None:
     rng = np.random.default_rng(seed)
     mean, deviation = rng.random((20, 30)), 0.02 + rng.random((20, 30))
     deviation = cv2.GaussianBlur(deviation, (0, 0), 2) * 20
@@ -93,7 +93,7 @@ def test_the_answer_depends_neither_on_exposure_nor_on_orientation(seed: int, ga
     assert adds_light(*turned) == expected
 
 
-def test_too_few_edges_tell_nothing() -> None:
+def test_too_few_edges_count_as_hiding() -> None:
     edges = np.zeros((20, 30), bool)
     edges.flat[: MIN_EDGES - 1] = True
     assert not adds_light(np.eye(20, 30), np.ones((20, 30)), edges)

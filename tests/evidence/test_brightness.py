@@ -46,7 +46,7 @@ def test_large_frames_are_reduced_by_box_filtering():
     torch.testing.assert_close(means[0, 5, 7], image[15:18, 21:24].double().mean())
 
 
-def test_only_what_a_view_shows_counts():
+def test_masked_pixels_do_not_count():
     images = noise(2, 2, 3)
     seen = torch.tensor([[1, 0, 0], [1, 1, 0]], dtype=torch.bool)[..., None]
     blocks = BrightnessBlocks(2, 3)
@@ -58,7 +58,7 @@ def test_only_what_a_view_shows_counts():
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 2000), (2000, 1)])
-def test_strips_and_points_are_frames_too(size):
+def test_strips_and_single_pixels_are_accepted(size):
     blocks = BrightnessBlocks(*size)
     image = noise(1, *size)[0]
     blocks.add(image, None)

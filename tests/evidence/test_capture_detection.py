@@ -61,7 +61,7 @@ def test_clean_photos_give_none_and_a_white_mask(tmp_path):
     assert (np.asarray(Image.open(output / "mask_colmap.png")) == 255).all()
 
 
-def test_a_dataset_is_looked_at_camera_by_camera_and_only_where_it_trains(tiny_scene, tmp_path):
+def test_a_dataset_is_tested_per_camera_on_its_training_photos(tiny_scene, tmp_path):
     """Two sizes of frame, and clean test views that would thin the evidence out."""
     scene = Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
     transforms = json.loads((scene / "transforms.json").read_text())
@@ -107,7 +107,7 @@ def test_an_output_that_exists_is_left_alone(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-def test_a_video_is_taken_too(tmp_path):
+def test_a_video_is_accepted(tmp_path):
     data = photos(tmp_path / "photos", count=20)
     video = tmp_path / "walk.mp4"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"mp4v"), 10, (96, 64))
@@ -163,7 +163,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, capsys, spoil, compl
 @pytest.mark.parametrize(
     "options", [["--draws", "10"], ["--json", "nowhere/found.json"], ["--json", "/"], ["--threads", "0"]]
 )
-def test_arguments_that_make_no_sense_are_refused(tmp_path, capsys, options):
+def test_invalid_arguments_are_refused(tmp_path, capsys, options):
     with pytest.raises(SystemExit) as refused:
         main(["detect", "--data", str(tmp_path), *options])
     assert refused.value.code == 2

@@ -58,7 +58,7 @@ def board() -> np.ndarray:
 
 @pytest.mark.parametrize("views", [12, 25, 50])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_capture_without_artifact_raises_no_alarm(views, seed):
+def test_a_capture_without_artifact_has_verdict_none(views, seed):
     found = detect(statistics_of(capture(views, seed)))
     assert found.verdict == "none"
     assert found.coverage == 0
@@ -78,7 +78,7 @@ def test_a_faint_logo_is_found_where_it_is(views):
     assert found.coverage == pytest.approx(float(found.mask.float().mean()))
 
 
-def test_an_opaque_board_is_found_with_its_plain_inside():
+def test_an_opaque_board_is_found_with_its_uniform_inside():
     found = detect(statistics_of(behind(capture(25), board())))
     assert found.verdict == "opaque"
     assert found.mask[72:].all()
@@ -86,7 +86,7 @@ def test_an_opaque_board_is_found_with_its_plain_inside():
 
 
 @pytest.mark.parametrize("views", [12, 40])
-def test_a_plain_corner_is_found_though_it_has_few_edges(views):
+def test_a_uniform_corner_is_found_though_it_has_few_edges(views):
     """A thumb, a tripod's leg: 6 % of the frame, whose edges alone would be too few to report."""
     matte = np.zeros((480, 640))
     matte[360:, :160] = 1.0
@@ -98,7 +98,7 @@ def test_a_plain_corner_is_found_though_it_has_few_edges(views):
     assert found.coverage == pytest.approx(0.0625, abs=0.02)
 
 
-def test_a_plain_sky_without_static_edges_is_no_artifact():
+def test_a_uniform_sky_without_static_edges_is_no_artifact():
     """All views agree on the upper half; its lower border moves, as a skyline does. The board below does not."""
     photos = behind(capture(30), board())
     rng = np.random.default_rng(5)
@@ -136,7 +136,7 @@ def test_the_static_area_is_empty_without_static_edges_and_the_whole_frame_with_
     assert unknown.near.all()
 
 
-def test_what_recurs_without_staying_in_place_is_no_artifact():
+def test_recurring_content_that_moves_is_no_artifact():
     """A dark square in the middle of every view, as when walking around something: never twice at the same pixels."""
     photos = capture(40)
     rng = np.random.default_rng(1)
@@ -181,35 +181,35 @@ def test_an_artifact_is_found_with_a_trembling_camera(views):
     assert found.mask[72:].float().mean() > 0.9
 
 
-def test_vignetting_alone_is_smooth_and_raises_no_alarm():
+def test_vignetting_alone_is_no_artifact():
     y, x = np.mgrid[-1 : 1 : HEIGHT * 1j, -1 : 1 : WIDTH * 1j]
     fall = 1 - 0.15 * (x**2 + y**2)
     photos = [(photo * fall[..., None]).astype(np.uint8) for photo in capture(40)]
     assert detect(statistics_of(photos)).verdict == "none"
 
 
-def test_below_the_faintest_gradient_nothing_counts():
+def test_gradients_below_the_minimum_do_not_count():
     """A pattern of one gray level on equal photos: all views agree to the bit, and nobody could see it."""
     photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     photo[::2] += 1
     assert detect(statistics_of([photo] * 20)).verdict == "none"
 
 
-def test_identical_photos_are_all_artifact():
+def test_identical_photos_are_artifact_everywhere():
     """Nothing moves: the camera stood still, and neither poses nor an overlay can be told from them."""
     found = detect(statistics_of(capture(1) * 20))
     assert found.verdict == "opaque"
     assert found.coverage > 0.9
 
 
-def test_too_few_views_give_no_verdict():
+def test_too_few_views_have_verdict_none():
     found = detect(statistics_of(behind(capture(5), board())))
     assert found.verdict == "none"
     assert found.p_value == 1.0
     assert found.p_interval == (0.0, 1.0)
 
 
-def test_the_same_seed_gives_the_same_and_global_random_state_is_left_alone():
+def test_detection_is_reproducible_and_leaves_global_random_state_alone():
     statistics = statistics_of(behind(capture(12), logo(0.2)))
     torch.manual_seed(1)
     np.random.seed(1)  # noqa: NPY002 - the state that must not change
@@ -224,7 +224,7 @@ def test_the_same_seed_gives_the_same_and_global_random_state_is_left_alone():
     assert detect(statistics, seed=1).verdict == first.verdict
 
 
-def test_what_masks_hide_makes_no_edge():
+def test_masked_pixels_cause_no_edge():
     """Black below a user's mask that is the same in all views: its outline must not be taken for an artifact."""
     seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
     seen[60:, 20:80] = False
@@ -234,7 +234,7 @@ def test_what_masks_hide_makes_no_edge():
     assert found.verdict == "faint"
 
 
-def test_masks_that_differ_from_view_to_view_make_no_edge():
+def test_masks_that_differ_between_views_cause_no_edge():
     rng = np.random.default_rng(0)
     views = []
     for photo in capture(25):
@@ -245,7 +245,7 @@ def test_masks_that_differ_from_view_to_view_make_no_edge():
     assert detect(accumulate(views)).verdict == "none"
 
 
-def test_the_type_of_the_photos_changes_nothing():
+def test_the_dtype_of_the_photos_changes_nothing():
     photos = behind(capture(16), logo(0.4))
     bytes_, words, floats = (
         accumulate((torch.from_numpy(convert(photo)), None) for photo in photos)

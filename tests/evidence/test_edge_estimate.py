@@ -29,7 +29,7 @@ def seen(matte: np.ndarray, color: float, seed: int = 0) -> tuple[np.ndarray, np
 
 
 @pytest.mark.parametrize("alpha", [0.2, 0.4, 0.7])
-def test_matte_and_difference_of_a_logo_come_from_its_outline(alpha: float) -> None:
+def test_matte_and_difference_of_a_logo_are_estimated_from_its_outline(alpha: float) -> None:
     """The unknown scene behind varies slowly: the estimate keeps half of the logo, and drops the scene."""
     matte = alpha * logo()
     mean, deviation, edges = seen(matte, color=1.0)
@@ -43,7 +43,7 @@ def test_matte_and_difference_of_a_logo_come_from_its_outline(alpha: float) -> N
     assert (found.matte[outside] > 0).mean() < 0.15
 
 
-def test_what_stays_in_place_without_static_edges_is_nothing() -> None:
+def test_without_static_edges_the_estimate_is_zero() -> None:
     """A sky above a skyline: mean and deviation have a border there, but no static edge."""
     mean, deviation, edges = seen(0.4 * logo(), color=1.0)
     mean[:, :10], deviation[:10] = 0.9, 0.001
@@ -52,7 +52,7 @@ def test_what_stays_in_place_without_static_edges_is_nothing() -> None:
     assert not found.difference[:, :9].any()
 
 
-def test_opaque_is_where_the_deviation_rises_at_the_border() -> None:
+def test_areas_are_opaque_where_the_deviation_rises_at_their_outline() -> None:
     """A board behind which nothing shows; a path that stays in place, ending in drops of mud."""
     deviation = np.full((HEIGHT, WIDTH), 0.2)
     board, path = np.zeros((2, HEIGHT, WIDTH), np.uint8)
@@ -95,7 +95,7 @@ def test_any_frame_gives_finite_layers_of_its_size(height: int, width: int, seed
     assert not empty.difference.any()
 
 
-def test_far_from_edges_the_estimate_is_nothing_though_it_leaks() -> None:
+def test_far_from_edges_the_estimate_is_zero_although_it_leaks() -> None:
     """The logo's outline is open towards the right: what is integrated goes on there."""
     matte = 0.6 * logo()
     mean, deviation, edges = seen(matte, color=1.0)
@@ -111,7 +111,7 @@ def test_far_from_edges_the_estimate_is_nothing_though_it_leaks() -> None:
     assert found.matte[:, :70].any()
 
 
-def test_a_calm_area_with_a_texture_of_its_own_is_told_from_one_that_changes() -> None:
+def test_textured_areas_have_dense_edges_and_low_deviation() -> None:
     """A bonnet below; an equally dense texture above, where the scene changes behind it."""
     rng = np.random.default_rng(4)
     edges = np.zeros((HEIGHT, WIDTH), np.uint8)

@@ -22,7 +22,7 @@ def capture(height: int, width: int, views: int = 12) -> tuple[np.ndarray, Image
     return photos, accumulate((torch.from_numpy(photo), None) for photo in photos)
 
 
-def test_color_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_over_0_05() -> None:
+def test_initial_color_is_the_mean_and_initial_matte_exp_of_minus_sigma_over_0_05() -> None:
     photos, statistics = capture(9, 13)
     overlay = ScreenSpaceOverlay(9, 13)
     initialize(overlay, statistics)
@@ -38,7 +38,7 @@ def test_color_starts_at_the_mean_and_the_matte_at_exp_of_minus_the_deviation_ov
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_by_default_only_what_static_edges_enclose_starts_opaque(resolution: int) -> None:
+def test_only_areas_that_static_edges_enclose_are_initialized_opaque(resolution: int) -> None:
     """A plain board below, a plain sky above: the views agree on both, but the sky's edge moves."""
     rng = np.random.default_rng(3)
     photos = rng.integers(0, 256, (20, 48, 64, 3), dtype=np.uint8)
@@ -57,7 +57,7 @@ def test_by_default_only_what_static_edges_enclose_starts_opaque(resolution: int
     assert (overlay.matte() > 0.98).double().mean() > 0.45
 
 
-def test_black_white_and_constant_pixels_start_with_finite_logits() -> None:
+def test_black_white_and_constant_pixels_have_finite_initial_logits() -> None:
     photo = torch.zeros(4, 6, 3, dtype=torch.uint8)
     photo[:, 3:] = 255
     overlay = ScreenSpaceOverlay(4, 6)
@@ -69,7 +69,7 @@ def test_black_white_and_constant_pixels_start_with_finite_logits() -> None:
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_color(resolution: int) -> None:
+def test_pixels_that_no_two_views_show_are_initialized_transparent_with_their_mean_color(resolution: int) -> None:
     photo = torch.full((4, 4, 3), 51, dtype=torch.uint8)
     once, never = torch.ones(4, 4, dtype=torch.bool), torch.ones(4, 4, dtype=torch.bool)
     once[:2] = False
@@ -79,14 +79,14 @@ def test_pixels_that_no_two_views_show_start_transparent_with_their_mean_color(r
     color, matte = (t.detach().repeat_interleave(resolution, 0).repeat_interleave(resolution, 1) for t in (
         overlay.color(), overlay.matte()
     ))  # fmt: skip
-    torch.testing.assert_close(color[:, :2], torch.full((4, 2, 3), 0.5))  # nobody knows
+    torch.testing.assert_close(color[:, :2], torch.full((4, 2, 3), 0.5))  # no view shows it
     torch.testing.assert_close(color[:, 2:], torch.full((4, 2, 3), 0.2))
     torch.testing.assert_close(matte[:, :2], torch.full((4, 2, 1), 0.01))
     torch.testing.assert_close(matte[:2], torch.full((2, 4, 1), 0.01))
     torch.testing.assert_close(matte[2:, 2:], torch.full((2, 2, 1), 0.99))
 
 
-def test_a_start_of_coarser_resolution_averages_the_premultiplied_colors() -> None:
+def test_a_coarser_overlay_averages_premultiplied_colors() -> None:
     photos, statistics = capture(8, 12)
     overlay = ScreenSpaceOverlay(8, 12, 2)
     initialize(overlay, statistics)
@@ -99,7 +99,7 @@ def test_a_start_of_coarser_resolution_averages_the_premultiplied_colors() -> No
 
 
 @pytest.mark.parametrize("resolution", [2, 4])
-def test_the_rows_that_fill_no_block_start_from_the_pixels_that_there_are(resolution: int) -> None:
+def test_partial_blocks_are_initialized_from_the_pixels_that_they_have(resolution: int) -> None:
     photo = torch.zeros(9, 7, 3, dtype=torch.uint8)
     photo[8:], photo[:, 6:] = 204, 204
     overlay = ScreenSpaceOverlay(9, 7, resolution)
@@ -149,7 +149,7 @@ def test_evidence_is_the_deviation_over_its_70th_percentile_where_opaque_and_one
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_what_the_edges_imply_is_what_the_layers_start_from(resolution: int) -> None:
+def test_initial_layers_are_those_estimated_from_the_edges(resolution: int) -> None:
     """Mean = T scene + B: with an estimated matte and difference, the scene behind comes out as estimated, too."""
     photos, statistics = capture(12, 16)
     mean = photos.mean(axis=0) / 255
@@ -166,7 +166,7 @@ def test_what_the_edges_imply_is_what_the_layers_start_from(resolution: int) -> 
     assert (overlay.near[..., 0].numpy() == np.repeat([[1, 0]], 8 // resolution, axis=1)).all()
 
 
-def test_where_edges_imply_nothing_the_overlay_starts_in_the_color_that_it_has_elsewhere() -> None:
+def test_without_an_estimate_the_initial_color_is_the_mean_of_the_estimated_ones() -> None:
     """A dark drop and a bright one, of the same color; a third was missed."""
     color, scene = torch.tensor([0.6, 0.3, 0.1]), torch.tensor([0.3, 0.7]).repeat_interleave(4)[:, None, None]
     photos = [(255 * scene.expand(8, 16, 3)).to(torch.uint8)] * 2
@@ -189,7 +189,7 @@ def test_where_edges_imply_nothing_the_overlay_starts_in_the_color_that_it_has_e
     torch.testing.assert_close(overlay.matte()[..., 0], matte.clamp_min(0.1), atol=1e-3, rtol=0)
 
 
-def test_what_is_opaque_or_only_colored_keeps_its_own_color_and_what_is_opaque_lends_it_to_nobody() -> None:
+def test_opaque_and_estimated_pixels_keep_their_color_and_opaque_ones_do_not_enter_the_mean() -> None:
     """From left to right: an opaque board, a drop, an edge too faint for a matte, nothing."""
     _, statistics = capture(6, 12)
     mean = statistics.mean().float()
@@ -211,7 +211,7 @@ def test_what_is_opaque_or_only_colored_keeps_its_own_color_and_what_is_opaque_l
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
-def test_what_adds_light_starts_from_the_difference_and_hides_only_where_it_is_opaque(resolution: int) -> None:
+def test_additive_light_is_initialized_from_the_difference_and_hides_only_where_opaque(resolution: int) -> None:
     _, statistics = capture(12, 16)
     opaque, near = halves(12, 16)
     overlay = ScreenSpaceOverlay(12, 16, resolution, adds_light=True)
@@ -225,7 +225,7 @@ def test_what_adds_light_starts_from_the_difference_and_hides_only_where_it_is_o
     assert (overlay.evidence[:, quarter:] == 1).all()
 
 
-def test_where_most_pixels_never_change_there_is_no_scale_and_evidence_stays_one() -> None:
+def test_evidence_is_one_where_most_pixels_never_change() -> None:
     photos = np.full((4, 5, 5, 3), 80, np.uint8)
     photos[1, 2, 2] = 90
     overlay = ScreenSpaceOverlay(5, 5)

@@ -119,7 +119,7 @@ def test_a_constant_pixel_of_float_images_deviates_by_less_than_any_scale_that_m
     assert accumulate((image, None) for _ in range(300)).deviation().max() < 1e-6
 
 
-def test_a_hot_pixel_stands_out_from_pixels_that_change() -> None:
+def test_a_hot_pixel_deviates_less_than_changing_pixels() -> None:
     images = np.random.default_rng(0).integers(0, 200, (50, 5, 6, 3), dtype=np.uint8)
     images[:, 2, 3] = 255
     statistics = gather(images)
@@ -129,13 +129,13 @@ def test_a_hot_pixel_stands_out_from_pixels_that_change() -> None:
     assert others.min() > 0.15
 
 
-def test_black_and_white_in_turn_deviate_by_one_half_the_most_there_is() -> None:
+def test_alternating_black_and_white_has_the_maximal_deviation_of_one_half() -> None:
     images = np.zeros((10, 3, 2, 3), np.uint8)
     images[::2] = 255
     assert (gather(images).deviation() == 0.5).all()
 
 
-def test_the_channel_that_changes_most_decides() -> None:
+def test_the_deviation_is_that_of_the_channel_that_varies_most() -> None:
     images = np.full((4, 1, 1, 3), 100, np.uint8)
     images[:2, 0, 0, 1] = 150
     images[:2, 0, 0, 2] = 110
@@ -151,7 +151,7 @@ def test_pixels_that_fewer_than_two_views_show_deviate_by_one() -> None:
     assert statistics.mean()[0, :, 0].tolist() == [0.2, 0.2, 0.5]
 
 
-def test_what_a_mask_hides_has_no_influence_not_even_as_nan() -> None:
+def test_masked_pixels_have_no_influence_not_even_as_nan() -> None:
     image = torch.full((2, 2, 3), 0.25)
     broken = image.clone()
     broken[0, 1] = float("nan")
@@ -184,7 +184,7 @@ def test_an_alpha_channel_is_ignored(dtype: torch.dtype) -> None:
     assert with_alpha.mean().shape == (4, 5, 3)
 
 
-def test_the_images_themselves_are_left_as_they_were() -> None:
+def test_inputs_are_not_modified() -> None:
     image = torch.rand(4, 5, 3, dtype=torch.float64)
     before, mask = image.clone(), torch.rand(4, 5) > 0.5
     accumulate([(image, mask), (image, None)])
@@ -219,7 +219,7 @@ def test_a_view_of_another_size_or_dtype_is_refused_and_leaves_the_sums_alone(ot
     [lambda s: s.size, lambda s: s.views, lambda s: s.mean(), lambda s: s.deviation()],
     ids=["size", "views", "mean", "deviation"],
 )
-def test_before_the_first_view_there_is_nothing_to_ask(ask: Callable[[ImageStatistics], object]) -> None:
+def test_statistics_without_views_raise(ask: Callable[[ImageStatistics], object]) -> None:
     with pytest.raises(ValueError, match="no image has been added"):
         ask(ImageStatistics())
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ssa_nerfstudio.cameras.lens import Lens, undistorted
+from ssa_nerfstudio.cameras.lens import Lens, undistorted_lens
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 
@@ -33,7 +33,7 @@ def one_camera(overlay: ScreenSpaceOverlay | OracleOverlay, lens: Lens | None = 
 
 def cameras(pairs: list[tuple]) -> Artifacts:
     """Artifacts of a rig: an overlay and its raw lens for each camera."""
-    targets = [undistorted(lens) for _, lens in pairs]
+    targets = [undistorted_lens(lens) for _, lens in pairs]
     keys = [[t.width, t.height, t.fx, t.fy, t.cx, t.cy] for t in targets]
     lenses = [
         [lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy, *lens.distortion, 1 + (lens.model == "fisheye")]

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 from small_checkpoints import cameras, one_camera, write_run
 
-from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted_lens
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.export.artifact_files import FILES
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
@@ -202,7 +202,7 @@ LENSES = {
 def test_the_raw_frame_is_that_of_the_photos(tmp_path, model, draw_effect, undistorted_layers):
     lens = LENSES[model]
     raw = draw_effect("watermark", HEIGHT, WIDTH)
-    target = undistorted(lens)
+    target = undistorted_lens(lens)
     inside = undistorted_layers(raw, lens)
     config = write_run(tmp_path / "run", one_camera(given(inside), lens))
     about = export(config, tmp_path / "out", "--raw-frame")["cameras"][0]
@@ -241,7 +241,7 @@ def test_an_artifact_in_front_of_gopro_walk_comes_back_through_its_lens(
     inside = undistorted_layers(raw, lens)
     export(write_run(tmp_path / "run", one_camera(given(inside), lens)), tmp_path / "out", "--raw-frame")
     clean = np.asarray(Image.open(captures / "gopro_walk" / t["frames"][10]["file_path"]).convert("RGB"))
-    target = undistorted(lens)
+    target = undistorted_lens(lens)
     known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > 0.999
     error = np.abs(laid_over(read_rgba(tmp_path / "out" / "overlay.png"), clean) - raw.apply(clean))[known]
     print(f"{effect}: mean {error.mean():.3f}, 99th percentile {np.percentile(error, 99):.2f} gray levels")

@@ -34,7 +34,7 @@ def matte_gradient(accumulation: float, over_splats: bool) -> torch.Tensor:
     return overlay.alpha_logits.grad
 
 
-def test_the_picture_is_that_of_plain_compositing():
+def test_the_image_is_that_of_plain_compositing():
     overlay, clean, opacity, background = scene(0.3)
     layers = overlay.layers()
     torch.testing.assert_close(
@@ -42,12 +42,12 @@ def test_the_picture_is_that_of_plain_compositing():
     )
 
 
-def test_plain_compositing_rewards_hiding_a_hole_and_this_does_not():
+def test_plain_compositing_rewards_hiding_background_and_compositing_over_splats_does_not():
     assert (matte_gradient(0.0, over_splats=False) < 0).all()
     assert matte_gradient(0.0, over_splats=True).abs().max() < 1e-12
 
 
-def test_splats_that_explain_the_photo_leave_nothing_to_gain():
+def test_the_matte_has_no_gradient_where_splats_explain_the_photo():
     assert matte_gradient(0.6, over_splats=True).abs().max() < 1e-12
 
 
@@ -71,7 +71,7 @@ def test_splats_and_color_get_the_plain_gradient():
 
 
 @pytest.mark.parametrize("over_splats", [True, False])
-def test_painting_by_hand_has_the_values_and_gradients_of_the_layers(over_splats):
+def test_composite_logits_has_the_values_and_gradients_of_the_layers(over_splats):
     generator = torch.Generator().manual_seed(0)
     overlay, _, _, background = scene(0.4)
     opacity, clean = (torch.rand(4, 5, c, generator=generator, dtype=torch.float64) for c in (1, 3))
@@ -100,7 +100,7 @@ def test_painting_by_hand_has_the_values_and_gradients_of_the_layers(over_splats
 @pytest.mark.parametrize("reduction", [1, 2])
 @pytest.mark.parametrize("adds_light", [False, True])
 @pytest.mark.parametrize("over_splats", [True, False])
-def test_an_overlay_is_in_front_of_a_render_as_its_layers_say(resolution, reduction, adds_light, over_splats):
+def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, over_splats):
     generator = torch.Generator().manual_seed(1)
     overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
     with torch.no_grad():

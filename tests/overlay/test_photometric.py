@@ -89,7 +89,7 @@ def test_the_gradient_of_the_photometric_loss_is_that_of_finite_differences(weig
     assert torch.autograd.gradcheck(lambda x: 100 * photometric_loss(x, target, weight), (prediction,), atol=1e-6)
 
 
-def test_the_gradient_scales_with_what_is_done_to_the_loss() -> None:
+def test_the_gradient_is_scaled_by_the_incoming_one() -> None:
     prediction, target = pair(15, 16)
     _, once = value_and_gradient(photometric_loss, prediction, target, 0.2)
     _, thrice = value_and_gradient(lambda *a: 3 * photometric_loss(*a) + 1, prediction, target, 0.2)
@@ -119,7 +119,7 @@ def test_at_weight_zero_it_is_l1_and_at_weight_one_it_is_one_minus_ssim() -> Non
 
 @both_dtypes
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_identical_images_lose_nothing(weight: float, dtype: torch.dtype) -> None:
+def test_identical_images_have_no_loss(weight: float, dtype: torch.dtype) -> None:
     _, target = pair(20, 25, dtype)
     value, gradient = value_and_gradient(photometric_loss, target, target, weight)
     assert abs(value.item()) < 10 * torch.finfo(dtype).eps
@@ -156,7 +156,7 @@ def test_the_layout_of_the_images_in_memory_does_not_matter() -> None:
 
 @pytest.mark.parametrize("broken", ["prediction", "target"])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_pixel_that_is_not_finite_shows_in_the_loss(value: float, broken: str) -> None:
+def test_the_loss_is_not_finite_where_a_pixel_is_not(value: float, broken: str) -> None:
     prediction, target = pair(20, 25, torch.float32)
     (prediction if broken == "prediction" else target)[7, 9, 1] = value
     assert not photometric_loss(prediction, target, 0.2).isfinite()

@@ -74,7 +74,7 @@ def test_a_constant_layer_stays_constant_at_any_training_scale(
 
 @settings(max_examples=60, deadline=None)
 @given(seed=st.integers(0, 1000), least=st.sampled_from([1e-3, 0.1, 1.0]))
-def test_straight_color_and_matte_come_back_from_the_premultiplied_pair(seed: int, least: float) -> None:
+def test_straight_color_inverts_premultiply(seed: int, least: float) -> None:
     color, alpha = random(5, 6, 3, seed=seed), least + (1 - least) * random(5, 6, 1, seed=seed + 1)
     transmittance, addition = premultiply(color, alpha)
     color_again, alpha_again = straight_color(transmittance, addition)
@@ -82,7 +82,7 @@ def test_straight_color_and_matte_come_back_from_the_premultiplied_pair(seed: in
     torch.testing.assert_close(color_again, color, rtol=0, atol=1e-12)
 
 
-def test_the_premultiplied_pair_comes_back_from_straight_color_and_matte() -> None:
+def test_premultiply_inverts_straight_color() -> None:
     alpha = random(5, 6, 1)
     alpha[:2] = 0
     transmittance, addition = 1 - alpha, alpha * random(5, 6, 3, seed=1)
@@ -99,7 +99,7 @@ def test_where_the_matte_is_zero_the_color_is_black_and_a_colored_transmittance_
     assert alpha.item() == pytest.approx(0.6)
 
 
-def test_light_that_hides_nothing_gets_the_least_matte_that_carries_it() -> None:
+def test_additive_light_gets_the_smallest_matte_that_carries_it() -> None:
     added = torch.tensor([[[0.3, 0.2, 0.0]]])
     color, alpha = straight_color(torch.ones(1, 1, 1), added)
     assert alpha.item() == pytest.approx(0.3)
@@ -150,7 +150,7 @@ def test_a_letterbox_of_the_same_size_is_the_layer_itself() -> None:
 
 
 @pytest.mark.parametrize("kind", ["learned", "given"])
-def test_around_a_fitted_overlay_the_render_is_untouched(kind: str) -> None:
+def test_around_a_letterboxed_overlay_the_render_is_unchanged(kind: str) -> None:
     overlay = ScreenSpaceOverlay(20, 30) if kind == "learned" else OracleOverlay(*[0.5 * random(20, 30, 3)] * 2)
     clean = random(50, 40, 3, dtype=torch.float32)
     transmittance, addition = letterboxed_layers(overlay, 50, 40)

@@ -63,14 +63,14 @@ def test_log_sparsity_is_strictly_concave_and_l1_is_not() -> None:
     assert sparsity_loss(0.5 * flat, flat, "l1").item() == 0.5
 
 
-def test_log_sparsity_spares_what_the_views_agree_on() -> None:
+def test_log_sparsity_spares_pixels_whose_views_agree() -> None:
     matte = 0.7 * flat
     agreed, disputed = sparsity_loss(matte, 0 * flat, "log"), sparsity_loss(matte, flat, "log")
     assert agreed.item() == pytest.approx(0.1 * disputed.item())
-    assert agreed > 0, "but not for nothing: the matte of a pixel nobody needs has to vanish"
+    assert agreed > 0, "an unneeded matte still has to vanish"
 
 
-def test_log_sparsity_presses_on_a_faint_matte_and_lets_an_opaque_one_be() -> None:
+def test_log_sparsity_has_a_large_gradient_on_a_faint_matte_and_a_small_one_on_an_opaque_one() -> None:
     slopes = []
     for alpha in (0.0, 0.1, 1.0):
         matte = (alpha * flat).requires_grad_()

@@ -84,7 +84,7 @@ def test_any_scene_projects_alike(
     assert_projections_agree((gaussians, viewmat[None], Ks), radius_clip=radius_clip)
 
 
-def test_off_screen_gaussians_whose_linearisation_is_clamped_agree() -> None:
+def test_off_screen_gaussians_with_clamped_linearization_agree() -> None:
     gaussians, viewmats, Ks = scene(40, WIDTH, HEIGHT, size=0.6, seed=3)
     gaussians["means"][:20, 0] = torch.linspace(2.2, 4.0, 20, dtype=torch.float64) * torch.tensor([1, -1]).repeat(10)
     gaussians["means"][20:, 1] = torch.linspace(2.0, 4.0, 20, dtype=torch.float64) * torch.tensor([1, -1]).repeat(10)
@@ -148,7 +148,7 @@ def test_harmonics_of_the_fourth_degree_agree() -> None:
     assert (fourth.colors - third.colors).abs().max() > 0.01
 
 
-def test_the_antialiased_mode_weakens_small_splats_as_much_as_torch_does() -> None:
+def test_the_antialiased_mode_scales_opacities_as_torch_does() -> None:
     made = scene(50, WIDTH, HEIGHT, size=0.01, seed=9)
     weakened = assert_projections_agree(made, antialiased=True)
     plain = assert_projections_agree(made)

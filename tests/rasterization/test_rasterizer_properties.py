@@ -30,7 +30,7 @@ def test_image_and_gradients_are_the_same_bits_on_any_number_of_threads(dtype: t
             assert torch.equal(results[threads][name], value), f"{name} differs on {threads} threads"
 
 
-def test_two_python_threads_that_draw_at_once_give_the_pictures_of_one() -> None:
+def test_two_python_threads_render_the_same_images_as_one() -> None:
     scenes = [scene(400, 60, 50, dtype=torch.float32, seed=seed) for seed in range(2)]
     alone = [draw(cpu.rasterization, *made, 60, 50) for made in scenes]
 
@@ -64,7 +64,7 @@ color = st.tuples(channel, channel, channel)
 
 @settings(max_examples=20, deadline=None, derandomize=True)
 @given(first=color, second=color, share=channel)
-def test_the_background_shines_through_in_proportion(
+def test_the_background_is_weighted_by_the_transmittance(
     first: tuple[float, ...], second: tuple[float, ...], share: float
 ) -> None:
     gaussians, viewmats, Ks = scene(30, 20, 18, size=0.1)
@@ -85,7 +85,7 @@ def test_the_background_shines_through_in_proportion(
 
 
 @every_body
-def test_nothing_behind_a_stack_of_opaque_splats_is_drawn_or_gets_a_gradient(name: str) -> None:
+def test_splats_behind_opaque_ones_are_not_drawn_and_get_no_gradient(name: str) -> None:
     gaussians, viewmats, Ks = scene(30, 3, 2, size=5.0, sh_degree=None)
     gaussians["means"][:, :2] = 0
     gaussians["means"][:, 2] = 3 + 0.01 * torch.arange(30)
@@ -126,7 +126,7 @@ def test_absgrad_is_the_sum_over_pixels_of_the_magnitudes_of_their_gradients() -
     assert (absgrad >= signed.abs() - 1e-14).all()
 
 
-def test_absgrad_is_left_out_unless_asked_for_and_changes_nothing_else() -> None:
+def test_absgrad_is_optional_and_changes_nothing_else() -> None:
     made = scene(50, 20, 20, cameras=2)
     with_it = draw(cpu.rasterization, *made, 20, 20, absgrad=True)
     without = draw(cpu.rasterization, *made, 20, 20)
@@ -172,7 +172,7 @@ def test_the_cpu_rasterizer_does_not_draw_gaussians_that_are_not_finite(broken: 
 
 @every_body
 @pytest.mark.parametrize("n", [0, 5])
-def test_where_nothing_is_visible_the_picture_is_the_background(name: str, n: int) -> None:
+def test_without_visible_gaussians_the_image_is_the_background(name: str, n: int) -> None:
     gaussians, viewmats, Ks = scene(5, 20, 18, cameras=2)
     gaussians = {key: value[:n] for key, value in gaussians.items()}
     gaussians["means"][:, 2] = -100.0
@@ -202,7 +202,7 @@ def test_a_graph_that_is_kept_gives_the_same_gradients_again() -> None:
 
 
 @every_body
-def test_the_picture_is_the_same_without_gradients(name: str) -> None:
+def test_the_image_is_the_same_without_gradients(name: str) -> None:
     made = scene(50, 24, 20)
     drawn = draw(BODIES[name], *made, 24, 20)
     with torch.no_grad():
@@ -214,7 +214,7 @@ def test_the_picture_is_the_same_without_gradients(name: str) -> None:
     assert not info["means2d"].requires_grad
 
 
-def test_info_tells_densification_what_it_reads() -> None:
+def test_info_has_the_entries_that_densification_reads() -> None:
     gaussians, viewmats, Ks = scene(40, 24, 20, cameras=2)
     gaussians["means"][:7] += 1000
     gaussians["means"].requires_grad_()

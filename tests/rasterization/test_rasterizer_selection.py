@@ -33,7 +33,7 @@ def test_a_body_is_selected_by_its_name() -> None:
         ("triangles", "cpu", "unknown rasterizer 'triangles'; choose auto, gsplat, cpu or reference"),
     ],
 )
-def test_an_impossible_choice_names_the_remedy(name: Any, device: str, message: str) -> None:
+def test_an_impossible_selection_names_the_remedy(name: Any, device: str, message: str) -> None:
     with pytest.raises(InputError, match=message):
         rasterizer(name, device)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
-from ssa_nerfstudio.cameras.lens import Lens, undistort, undistorted
+from ssa_nerfstudio.cameras.lens import Lens, undistort, undistorted_lens
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.photos import write_photo
 from ssa_nerfstudio.experiments.effects.composition import Composition
@@ -71,7 +71,7 @@ def undistorted_layers(layers: Layers, lens: Lens) -> Layers:
 
 def _first_views(views: list[View]) -> list[View]:
     """The first view of each camera, in order of appearance."""
-    lenses = [undistorted(view.lens) for view in views]
+    lenses = [undistorted_lens(view.lens) for view in views]
     described = np.array([(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses])
     groups = group_frames(described)
     return [views[groups.index(group)] for group in range(max(groups) + 1)]
