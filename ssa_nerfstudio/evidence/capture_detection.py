@@ -155,8 +155,8 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
 
 
 def _frames(source: Source, frames: int) -> Iterator[np.ndarray]:
-    for _, _, picture in source.video_frames(frames):
-        yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    for _, _, frame in source.video_frames(frames):
+        yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
 
 
 def _evidence_image(detection: Detection) -> np.ndarray:

@@ -35,8 +35,8 @@ class ScreenSpaceOverlay(nn.Module):
     """
 
     frame: Tensor
-    """[4] int64: height, width, resolution, adds_light. A checkpoint tells its overlay's size by it, before any photo
-    has been opened."""
+    """[4] int64: height, width, resolution, adds_light. On loading, a checkpoint gives the overlay's size by it, before
+    any photo is opened."""
     evidence: Tensor
     """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the views agree."""
     near: Tensor

@@ -5,7 +5,7 @@ threads; gradients are written once per (splat, band) and summed in a fixed orde
 
 Along a row of pixels the exponent of a Gaussian is a parabola, so alpha obeys a recurrence of two multiplications:
 alpha(x + 1) = alpha(x) * step(x), step(x + 1) = step(x) * exp(-xx). It replaces an exponential at each pixel, and runs
-in float64, where a row's rounding stays near 1e-14. The same parabola tells where alpha >= 1/255 begins and ends.
+in float64, where a row's rounding stays near 1e-14. Its roots bound the pixels with alpha >= 1/255.
 
 Shapes: V splats nearest first, B bands, S (splat, band) pairs; `rows` of a band are its pixel rows.
 """

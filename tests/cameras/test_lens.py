@@ -21,7 +21,7 @@ GOPRO_LIKE = Lens(212, 120, 110.0, 103.0, 106.0, 60.0, (-0.18, 0.024, 0, 0, 0.00
 
 
 def by_nerfstudio(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """nerfstudio's K [3, 3] (its own convention) and undistorted picture."""
+    """nerfstudio's K [3, 3] (its own convention) and undistorted image."""
     kind = CameraType.FISHEYE if lens.model == "fisheye" else CameraType.PERSPECTIVE
     distortion = get_distortion_params(**dict(zip(("k1", "k2", "k3", "k4", "p1", "p2"), lens.distortion, strict=True)))
     camera = Cameras(

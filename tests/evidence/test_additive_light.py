@@ -1,4 +1,4 @@
-"""Whether an artifact hides the scene is read off the deviation of the views across its edges."""
+"""Additive light: whether an artifact hides the scene shows in the deviation of the views across its edges."""
 
 from __future__ import annotations
 

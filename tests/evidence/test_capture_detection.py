@@ -170,11 +170,11 @@ def test_invalid_arguments_are_refused(tmp_path, capsys, options):
     assert options[0] in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(("plain", "largest"), [(False, 64), (True, 300)], ids=["pictures", "json"])
+@pytest.mark.parametrize(("plain", "largest"), [(False, 64), (True, 300)], ids=["images", "json"])
 def test_a_full_disk_leaves_nothing(plain, largest, tmp_path):
     """A limit on the size of files stands in for it: writing fails as on a full disk, in a real process.
 
-    Of plain photos the pictures are so small that only the report does not fit.
+    The images of uniform photos are so small that only the report does not fit.
     """
     data = photos(tmp_path / "photos")
     if plain:

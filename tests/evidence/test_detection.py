@@ -189,14 +189,14 @@ def test_vignetting_alone_is_no_artifact():
 
 
 def test_gradients_below_the_minimum_do_not_count():
-    """A pattern of one gray level on equal photos: all views agree to the bit, and nobody could see it."""
+    """A pattern of one gray level on equal photos: all views agree exactly, and it is invisible."""
     photo = np.full((HEIGHT, WIDTH, 3), 128, np.uint8)
     photo[::2] += 1
     assert detect(statistics_of([photo] * 20)).verdict == "none"
 
 
 def test_identical_photos_are_artifact_everywhere():
-    """Nothing moves: the camera stood still, and neither poses nor an overlay can be told from them."""
+    """Nothing moves: the camera stood still, and scene and artifact cannot be separated."""
     found = detect(statistics_of(capture(1) * 20))
     assert found.verdict == "opaque"
     assert found.coverage > 0.9

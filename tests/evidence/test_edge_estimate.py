@@ -1,4 +1,4 @@
-"""What an artifact looks like before anything is trained, from its edges."""
+"""Layers of an artifact estimated from its edges."""
 
 import cv2
 import numpy as np
@@ -96,7 +96,7 @@ def test_any_frame_gives_finite_layers_of_its_size(height: int, width: int, seed
 
 
 def test_far_from_edges_the_estimate_is_zero_although_it_leaks() -> None:
-    """The logo's outline is open towards the right: what is integrated goes on there."""
+    """The logo's outline is open at the right, where the integral continues."""
     matte = 0.6 * logo()
     mean, deviation, edges = seen(matte, color=1.0)
     wide = 3 * WIDTH

@@ -1,4 +1,4 @@
-"""An overlay gains nothing by hiding background that no splat covers."""
+"""Compositing over splats: the matte has no gradient towards hiding background."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ def matte_gradient(accumulation: float, over_splats: bool) -> torch.Tensor:
     overlay, clean, opacity, background = scene(accumulation)
     transmittance, addition = overlay.layers()
     if over_splats:
-        picture = composite_over_splats(clean, opacity, background, transmittance, addition)
+        image = composite_over_splats(clean, opacity, background, transmittance, addition)
     else:
-        picture = composite(clean, transmittance, addition)
-    (picture - overlay.color().detach()).square().sum().backward()
+        image = composite(clean, transmittance, addition)
+    (image - overlay.color().detach()).square().sum().backward()
     assert overlay.alpha_logits.grad is not None
     return overlay.alpha_logits.grad
 
@@ -85,13 +85,13 @@ def test_composite_logits_has_the_values_and_gradients_of_the_layers(over_splats
         leaf = clean.clone().requires_grad_()
         overlay.zero_grad()
         if by_hand:
-            picture = composite_logits(leaf, overlay.color_logits, overlay.alpha_logits, behind)
+            image = composite_logits(leaf, overlay.color_logits, overlay.alpha_logits, behind)
         elif behind is None:
-            picture = composite(leaf, *overlay.layers())
+            image = composite(leaf, *overlay.layers())
         else:
-            picture = composite_over_splats(leaf, *behind, *overlay.layers())
-        (picture - target).square().sum().backward()
-        found.append((picture.detach(), leaf.grad, overlay.color_logits.grad, overlay.alpha_logits.grad))
+            image = composite_over_splats(leaf, *behind, *overlay.layers())
+        (image - target).square().sum().backward()
+        found.append((image.detach(), leaf.grad, overlay.color_logits.grad, overlay.alpha_logits.grad))
     for ours, theirs in zip(*found, strict=True):
         torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-14)
 

@@ -1,4 +1,4 @@
-"""Resampling of premultiplied layers: sizes, averages, letterboxes, and the way there and back."""
+"""Resampling of premultiplied layers: sizes, averages, letterboxes, and inverses."""
 
 from __future__ import annotations
 
@@ -73,9 +73,9 @@ def test_a_constant_layer_stays_constant_at_any_training_scale(
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 1000), least=st.sampled_from([1e-3, 0.1, 1.0]))
-def test_straight_color_inverts_premultiply(seed: int, least: float) -> None:
-    color, alpha = random(5, 6, 3, seed=seed), least + (1 - least) * random(5, 6, 1, seed=seed + 1)
+@given(seed=st.integers(0, 1000), min_alpha=st.sampled_from([1e-3, 0.1, 1.0]))
+def test_straight_color_inverts_premultiply(seed: int, min_alpha: float) -> None:
+    color, alpha = random(5, 6, 3, seed=seed), min_alpha + (1 - min_alpha) * random(5, 6, 1, seed=seed + 1)
     transmittance, addition = premultiply(color, alpha)
     color_again, alpha_again = straight_color(transmittance, addition)
     torch.testing.assert_close(alpha_again, alpha, rtol=0, atol=1e-14)
@@ -117,7 +117,7 @@ def test_a_letterbox_never_stretches_and_leaves_its_bars_clear(
     filled = framed[..., 0] != 1.0
     rows, columns = filled.any(dim=1), filled.any(dim=0)
     inner_height, inner_width = int(rows.sum()), int(columns.sum())
-    assert torch.equal(filled, rows[:, None] & columns[None, :]), "the picture is not one rectangle"
+    assert torch.equal(filled, rows[:, None] & columns[None, :]), "the layer does not fill one rectangle"
     torch.testing.assert_close(framed[filled], torch.full_like(framed[filled], 0.25))
     scale = min(into_height / height, into_width / width)
     assert abs(inner_height - height * scale) <= 0.5 or inner_height == 1

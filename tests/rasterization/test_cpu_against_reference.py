@@ -1,4 +1,4 @@
-"""The numba rasterizer draws, and differentiates, what the plain-torch reference in float64 does."""
+"""The numba rasterizer against the plain-torch reference in float64: images and gradients."""
 
 from __future__ import annotations
 

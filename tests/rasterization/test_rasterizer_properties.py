@@ -1,4 +1,4 @@
-"""What any right rasterizer does, and what this one promises beside: the same bits on any number of threads."""
+"""Properties of any correct rasterizer, and of the cpu one: the same bits on any number of threads."""
 
 from __future__ import annotations
 

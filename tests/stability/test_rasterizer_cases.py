@@ -22,14 +22,14 @@ from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 RASTERIZER = Family("Rasterizer")
 WIDTH, HEIGHT = 34, 22
 BODY: RasterizerName = "cpu"
-"""The body that is held to the cases in float32."""
+"""The body that is tested on the cases in float32."""
 SINGLE_PRECISION: list[dict[str, float]] = []
 """Relative errors of BODY in float32 by output, one entry for every scene that was drawn."""
 Gaussians = dict[str, Tensor]
 
 
 def gaussians(n: int, seed: int = 0, degree: int = 3) -> Gaussians:
-    """Ordinary Gaussians around (0, 0, 3) in front of a camera at the origin that looks along z."""
+    """Ordinary Gaussians around (0, 0, 3) in front of a camera at the origin with its axis along z."""
     generator = torch.Generator().manual_seed(seed)
     means = torch.rand(n, 3, generator=generator) * 2 - 1
     means[:, 2] += 3

@@ -1,4 +1,4 @@
-"""Hard cases of the statistics of a capture and of the overlay that starts from them."""
+"""Hard cases of the statistics of a capture and of the overlay that is initialized from them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def photos(views: int, size: tuple[int, int, int] = SIZE, seed: int = 0) -> np.n
 
 
 def started(statistics: ImageStatistics, resolution: int = 1) -> ScreenSpaceOverlay:
-    """An overlay that starts from the statistics and is usable: finite, its matte in range, its gradients alive."""
+    """Initialize an overlay from the statistics and check it: finite, its matte in range, its gradients not zero."""
     overlay = ScreenSpaceOverlay(*statistics.size, resolution)
     initialize(overlay, statistics)
     transmittance, addition = overlay.layers()
