@@ -90,7 +90,7 @@ def test_the_picture_does_not_become_softer_with_time(page):
 
 def test_the_summary_and_the_saved_picture_are_the_artifacts(page, config, tmp_path):
     overlay = Checkpoint.read(config).artifacts()
-    page.get_by_text(overlay.figures(0)).wait_for(timeout=60_000)
+    page.get_by_text(overlay.summary(0)).wait_for(timeout=60_000)
     with page.expect_download(timeout=60_000) as download:
         page.get_by_role("button", name="Save artifact").click()
     assert download.value.suggested_filename == "artifact-camera-0.png"

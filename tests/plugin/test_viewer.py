@@ -178,7 +178,7 @@ def test_one_overlay_of_a_rig_can_be_chosen(model, camera, monkeypatch):
     choose(model, a_show=True)
     frame(model, camera)
     choose(model, d_camera="camera 2")
-    monkeypatch.setattr(Artifacts, "figures", lambda self, group: "")
+    monkeypatch.setattr(Artifacts, "summary", lambda self, group: "")
     frame(model, camera)
     assert asked == [None, 2]
 
