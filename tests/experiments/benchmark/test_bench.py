@@ -8,6 +8,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -17,10 +18,11 @@ from conftest import at_work
 from made_results import benchmark, folder_of, result
 
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.experiments.benchmark.execution import worker_task
+from ssa_nerfstudio.experiments.benchmark.execution.dask_runner import DaskRunner
 from ssa_nerfstudio.experiments.benchmark.execution.execute import Expectation, select
-from ssa_nerfstudio.experiments.benchmark.execution.local_runner import Local
-from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
-from ssa_nerfstudio.experiments.benchmark.execution.run_process import REQUEST, Request
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
+from ssa_nerfstudio.experiments.benchmark.execution.run_process import Request
 from ssa_nerfstudio.experiments.benchmark.results import read_all
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
 from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
@@ -167,53 +169,78 @@ def test_a_dask_cluster_runs_what_it_is_given(tmp_path):
     assert not list((tmp_path / "out" / "running").iterdir())
 
 
+def children() -> set[psutil.Process]:
+    """Processes below this one, without that of `multiprocessing` which stays for good."""
+    found = psutil.Process().children(recursive=True)
+    return {child for child in found if not any("resource_tracker" in word for word in child.cmdline())}
+
+
 def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tmp_path):
     """Runs that fail, for there is no dataset. A process that was killed while it waited is replaced."""
-    place = Workplace(tmp_path)
-    this = psutil.Process()
-    before = set(this.children())
-    ready: dict[int, bool] = {}
-    waited: set[int] = set()
+    folder = ResultsFolder(tmp_path)
+    before = children()
+    devices: dict[str, str | None] = {}
     results = []
 
-    def watch(processes, waiting):
-        working = {process.popen.pid for process in processes}
-        for process in processes:
-            if process.popen.pid not in ready:
-                ready[process.popen.pid] = process.popen.pid in waited
-                request = Request.load(place.running(process.run.id) / REQUEST)
-                assert request.flip_processes == min(16, max(1, (os.cpu_count() or 1) // 2))
-                assert psutil.Process(process.popen.pid).environ()["CUDA_VISIBLE_DEVICES"] == process.device
-        others = {child for child in this.children() if child not in before and child.pid not in working}
-        waited.update(child.pid for child in others)
-        assert len(others) <= (2 if waiting else 1)
-        if len(results) == 2 and len(waiting) == 1:
-            for child in others:
-                child.kill()
+    def watch(requests, waiting):
+        for request in requests:
+            assert request.flip_processes == min(16, max(1, (os.cpu_count() or 1) // 2))
+            devices[request.run.id] = request.device
 
     def ended(run, result):
         results.append((run.id, result.run.id, result.status))
 
     runs = plan(benchmark())[:5]
-    local = Local(place, ["4", "7"], 1, lambda run: "the command")
-    assert local.work(runs, lambda run: None, None, watch, ended) == []
+    runner = DaskRunner(folder, ["4", "7"], 1, lambda run: "the command")
+    assert runner.work(runs, lambda run: None, None, watch, ended) == []
     assert sorted(results) == sorted((run.id, run.id, "failed") for run in runs)
-    assert all(run.dataset in place.log(run.id).read_text() for run in runs)
-    assert list(ready.values()) == [False, False, True, True, False]
-    assert set(this.children()) == before
-    assert list(place.unfinished.iterdir()) == []
+    assert all(run.dataset in folder.log(run.id).read_text() for run in runs)
+    assert set(devices.values()) == {"4", "7"}
+    assert children() == before
+    assert list(folder.unfinished.iterdir()) == []
 
 
-def test_what_waits_for_a_run_ends_with_the_benchmark(tmp_path):
+def test_a_process_that_was_killed_while_it_waited_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    runs = plan(benchmark())[:2]
+    requests = [Request(run, str(tmp_path), 1, "the command") for run in runs]
+    first = worker_task.perform(requests[0], prepare_next=True)
+    waiting = worker_task._prepared
+    assert waiting is not None
+    waiting._popen.kill()
+    waiting._popen.wait()
+    second = worker_task.perform(requests[1], prepare_next=False)
+    assert [result and result.status for result in (first, second)] == ["failed", "failed"]
+    assert worker_task._prepared is None
+    assert list(ResultsFolder(tmp_path).unfinished.iterdir()) == []
+
+
+def test_a_run_whose_request_is_removed_is_stopped(tmp_path):
+    folder = ResultsFolder(tmp_path)
+    (run,) = plan(benchmark())[:1]
+
+    def remove():
+        while not folder.request(run.id).exists():
+            time.sleep(0.05)
+        folder.request(run.id).unlink()
+
+    thread = threading.Thread(target=remove)
+    thread.start()
+    assert worker_task.perform(Request(run, str(tmp_path), 1, "the command"), prepare_next=False) is None
+    thread.join()
+    assert at_work(tmp_path) == []
+
+
+def test_processes_end_with_an_interrupted_benchmark(tmp_path):
     def ended(run, result):
         raise KeyboardInterrupt
 
-    before = set(psutil.Process().children())
-    local = Local(Workplace(tmp_path), ["0"], 1, lambda run: "the command")
+    before = children()
+    runner = DaskRunner(ResultsFolder(tmp_path), ["0"], 1, lambda run: "the command")
     with pytest.raises(KeyboardInterrupt):
-        local.work(plan(benchmark())[:2], lambda run: None, None, lambda *_: None, ended)
-    assert set(psutil.Process().children()) == before
-    assert list(Workplace(tmp_path).unfinished.iterdir()) == []
+        runner.work(plan(benchmark())[:3], lambda run: None, None, lambda *_: None, ended)
+    assert children() == before
+    assert list(ResultsFolder(tmp_path).unfinished.iterdir()) == []
 
 
 def test_imports_are_done_while_the_run_before_is_at_work(tmp_path, monkeypatch):

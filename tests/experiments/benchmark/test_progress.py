@@ -21,11 +21,11 @@ RUNS = plan(benchmark())[:4]
 
 @dataclass
 class Working:
-    """What the table asks of a process."""
+    """What the table asks of a request."""
 
     run: Run
     device: str
-    started: float
+    asked: float
 
     def state(self) -> tuple[str, int]:
         return "training", 50
@@ -34,11 +34,11 @@ class Working:
 def drawn(terminal: bool, ended: list[tuple[Run, Result | None]]) -> str:
     """What is printed of four runs: the first was done before, the third works, the last waits."""
     stream = io.StringIO()
-    process: Any = Working(RUNS[2], "3", time.monotonic() - 61)
+    request: Any = Working(RUNS[2], "3", time.time() - 61)
     with ProgressTable(Console(file=stream, force_terminal=terminal, width=200), len(RUNS), 1, 1) as table:
         for run, outcome in ended:
             table.ended(run, outcome)
-        table.watch([process], RUNS[3:])
+        table.watch([request], 1)
     return stream.getvalue()
 
 

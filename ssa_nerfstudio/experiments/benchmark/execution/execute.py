@@ -12,11 +12,10 @@ from pathlib import Path
 from rich.console import Console
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.execution.cluster_runner import Cluster
+from ssa_nerfstudio.experiments.benchmark.execution.dask_runner import DaskRunner
 from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
-from ssa_nerfstudio.experiments.benchmark.execution.local_runner import Local
 from ssa_nerfstudio.experiments.benchmark.execution.progress_table import ProgressTable
-from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.results import Result, adopt, read_all
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.experiments.runs.machine import devices
@@ -57,7 +56,7 @@ def select(runs: list[Run], scenes: tuple[str, ...], only: tuple[str, ...]) -> l
     return chosen
 
 
-def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, console: Console) -> list[Run]:
+def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Options, console: Console) -> list[Run]:
     """Brings the results folder up to date with the runs.
 
     Args:
@@ -103,12 +102,8 @@ def bench(runs: list[Run], place: Workplace, invocation: str, options: Options, 
         for training, same in names.items():
             for run in same if training in known else ():
                 table.ended(run, adopt(known[training], run, place.folder))
-        if options.scheduler is not None:
-            cluster = Cluster(place, options.scheduler, options.runs_per_device, command, options.keep_models)
-            left = cluster.work(todo, deadline, table.watch_cluster, ended)
-        else:
-            local = Local(place, found, options.runs_per_device, command, options.keep_models)
-            left = local.work(todo, expected.seconds, deadline, table.watch, ended)
+        runner = DaskRunner(place, found, options.runs_per_device, command, options.keep_models, options.scheduler)
+        left = runner.work(todo, expected.seconds, deadline, table.watch, ended)
     return [same for run in left for same in names[run.training]]
 
 
@@ -143,7 +138,7 @@ class Expectation:
         return statistics.median(fixed) + run.steps * statistics.median(steps)
 
 
-def reach(folder: Path) -> Workplace:
+def reach(folder: Path) -> ResultsFolder:
     """The workplace of an output folder.
 
     Raises:
@@ -151,4 +146,4 @@ def reach(folder: Path) -> Workplace:
     """
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{folder} is a file", "name a folder with --output")
-    return Workplace(folder)
+    return ResultsFolder(folder)

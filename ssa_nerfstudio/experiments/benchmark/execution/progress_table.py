@@ -11,7 +11,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from ssa_nerfstudio.experiments.benchmark.execution.local_runner import Process
+from ssa_nerfstudio.experiments.benchmark.execution.run_process import Request
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 
@@ -46,29 +46,24 @@ class ProgressTable:
         self._ended.append((run, result))
         self._console.print(f"{self._number()} {run.id}: {_outcome(result)}", highlight=False, soft_wrap=True)
 
-    def watch(self, processes: list[Process], waiting: list[Run]) -> None:
-        """Draw what the processes do."""
+    def watch(self, requests: list[Request], waiting: int) -> None:
+        """Draw the runs at work, and how many wait."""
         if self._live is None:
             return
         table = Table(box=None, padding=(0, 1), expand=False)
         for column in ("run", "device", "", "steps", "", "seconds"):
             table.add_column(column, no_wrap=True, justify="right" if column in ("steps", "seconds") else "left")
-        for process in processes:
-            stage, step = process.state()
+        for request in requests:
+            stage, step = request.state()
             table.add_row(
-                process.run.id,
-                f"GPU {process.device}" if process.device else "CPU",
+                request.run.id,
+                f"GPU {request.device}" if request.device else "CPU",
                 stage,
-                f"{step} / {process.run.steps}",
-                ProgressBar(total=process.run.steps, completed=step, width=20),
-                f"{time.monotonic() - process.started:.0f}",
+                f"{step} / {request.run.steps}",
+                ProgressBar(total=request.run.steps, completed=step, width=20),
+                f"{time.time() - (request.asked or time.time()):.0f}",
             )
-        self._live.update(Group(table, Text(self._summary(len(processes), len(waiting)))))
-
-    def watch_cluster(self, running: int, waiting: int) -> None:
-        """Draw what a cluster does."""
-        if self._live is not None:
-            self._live.update(Text(self._summary(running, waiting)))
+        self._live.update(Group(table, Text(self._summary(len(requests), waiting))))
 
     def _number(self) -> str:
         return f"[{self._before + len(self._ended)}/{self._total}]"

@@ -12,7 +12,7 @@ from ssa_nerfstudio._system.file_lock import locked_folder
 
 
 @dataclass(frozen=True)
-class Workplace:
+class ResultsFolder:
     """The output folder of `ssa bench` and `ssa tradeoff`."""
 
     folder: Path
@@ -47,6 +47,14 @@ class Workplace:
     def running(self, run: str) -> Path:
         """Where a run works until it has finished."""
         return self.unfinished / run
+
+    def request(self, run: str) -> Path:
+        """What is asked of a run at work; removing it stops the run."""
+        return self.running(run) / "request.json"
+
+    def progress(self, run: str) -> Path:
+        """What a run at work does, and how many steps are done, in one line."""
+        return self.running(run) / "progress"
 
     @contextmanager
     def held(self) -> Iterator[None]:

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
-from ssa_nerfstudio.experiments.benchmark.execution.results_folder import Workplace
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.results import Result, write
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.experiments.configuration import build
@@ -27,10 +28,6 @@ if TYPE_CHECKING:
     from ssa_nerfstudio.plugin.pipeline import SSAPipeline
     from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
 
-PROGRESS = "progress"
-"""File in a run's folder: what it does, and how many steps are done, in one line."""
-REQUEST = "request.json"
-"""File in a run's folder: what is asked for."""
 OVERLAY_SETTINGS = ("overlay", "sparsity", "ignore_background")
 """Settings of the model whose names begin so are the overlay's."""
 _SCHEDULED = (
@@ -60,18 +57,36 @@ class Request:
     """Keep nerfstudio's folder with config.yml and checkpoint in `models/`."""
     flip_processes: int = 1
     """Processes that compare views by FLIP."""
+    device: str | None = None
+    """CUDA device of the process; None: the CPU, or whatever torch takes."""
     asked: float | None = None
     """When the process was asked, in seconds since the epoch: what is waited for before the first step begins here.
     None: as it starts work."""
 
     def store(self, path: Path) -> None:
         """Write for the process to read."""
-        path.write_text(json.dumps(dataclasses.asdict(self)), encoding="utf-8")
+        scratch = path.with_suffix(".part")
+        scratch.write_text(json.dumps(dataclasses.asdict(self)), encoding="utf-8")
+        scratch.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> Request:
-        """Read in the process."""
-        return build(cls, json.loads(path.read_text(encoding="utf-8")), str(path))
+        """Read in the process.
+
+        Raises:
+            InputError: it is not there, or not complete.
+        """
+        try:
+            return build(cls, json.loads(path.read_text(encoding="utf-8")), str(path))
+        except (OSError, ValueError) as error:
+            raise InputError(f"{path} holds no request ({error})") from error
+
+    def state(self) -> tuple[str, int]:
+        """What the process does, and how many training steps are done."""
+        with contextlib.suppress(OSError, ValueError):
+            stage, steps = ResultsFolder(Path(self.folder)).progress(self.run.id).read_text().split()
+            return stage, int(steps)
+        return "starting", 0
 
 
 def work(request: Request, revision: str) -> Result:
@@ -84,8 +99,8 @@ def work(request: Request, revision: str) -> Result:
     from ssa_nerfstudio.experiments.runs.machine import Company
 
     company = Company()
-    run, place = request.run, Workplace(Path(request.folder))
-    note = _Progress(place.running(run.id) / PROGRESS)
+    run, place = request.run, ResultsFolder(Path(request.folder))
+    note = _Progress(place.progress(run.id))
     note.stage("loading")
     result = Result(run, "failed", command=request.command, revision=revision)
     try:
@@ -126,7 +141,7 @@ def work(request: Request, revision: str) -> Result:
     return result
 
 
-def _configuration(run: Run, place: Workplace) -> SSATrainerConfig:
+def _configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:
     """nerfstudio's configuration of a run."""
     from ssa_nerfstudio.experiments.runs import training_run as training
 
@@ -164,7 +179,7 @@ def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
     return {"factor": config.max_num_iterations / FULL_LENGTH, **values}
 
 
-def _artifact(run: Run, pipeline: SSAPipeline, place: Workplace) -> dict[str, float]:
+def _artifact(run: Run, pipeline: SSAPipeline, place: ResultsFolder) -> dict[str, float]:
     """Scores of the learned overlays, mean over cameras; empty where none was learned or no truth is known."""
     truth = place.scenes / run.dataset / "layers" / "undistorted.npz"
     learned = pipeline.model.artifacts.learned()
@@ -195,7 +210,7 @@ class _Progress:
                 self._path.write_text(f"training {done}")
 
 
-def main(place: Workplace) -> int:
+def main(place: ResultsFolder) -> int:
     """Do the run that is asked for; 0 where a result was reached or nothing asked, 1 where the run failed."""
     end_with_parent()
     with contextlib.suppress(Exception):  # where it is needed, and the run's result can say so, it fails again
@@ -206,10 +221,10 @@ def main(place: Workplace) -> int:
     run = sys.stdin.readline().strip()
     if not run:
         return 0
-    result = work(Request.load(place.running(run) / REQUEST), imported)
+    result = work(Request.load(place.request(run)), imported)
     write(result, place.result(run))
     return 1 if result.status == "failed" else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(Workplace(Path(sys.argv[1]))))
+    sys.exit(main(ResultsFolder(Path(sys.argv[1]))))
