@@ -1,4 +1,4 @@
-"""`ssa detect`: the arguments and what they are handed to."""
+"""`ssa detect`."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ class Command:
     data: Path
     """A nerfstudio dataset (its training photos), a folder of photos or videos, or one video."""
     output: Path | None = None
-    """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Where it is not given:
-    outputs/detection/NAME, replaced if it is there."""
+    """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Default:
+    outputs/detection/NAME, which is replaced."""
     json: Path | None = None
     """File to write verdict, coverage, p_value, views and more of each camera to."""
     draws: int = 200
-    """Captures of randomly shifted views to compare with, at least 200."""
+    """Number of captures of randomly shifted views to compare with, at least 200."""
     frames: int = 200
-    """Frames to take from videos."""
+    """Number of frames to take from videos."""
     threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    """Photos decoded at once."""
+    """Number of photos decoded at once."""
 
     def run(self) -> None:
-        """Detect, say what was found, and write what was asked for.
+        """Detect, print the verdict, and write evidence, masks and JSON.
 
         Raises:
-            InputError: the arguments or photos cannot be worked with.
+            InputError: an option or a photo cannot be used.
         """
         import shutil
 
@@ -54,7 +54,7 @@ class Command:
         if self.json is not None and self.json.is_dir():
             raise InputError(f"--json {self.json} is a folder", "name a file")
         if self.output is not None and self.output.exists():
-            raise InputError(f"{self.output} exists already", "remove it or name another folder with --output")
+            raise InputError(f"{self.output} exists already", "remove it or choose another --output")
         output = self.output or Path("outputs/detection") / self.data.resolve().stem
         console = Console(highlight=False, soft_wrap=True)
         cameras = read_cameras(self.data, self.frames)

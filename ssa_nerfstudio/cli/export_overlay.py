@@ -10,31 +10,31 @@ from ssa_nerfstudio.errors import InputError
 
 @dataclass
 class Command:
-    """Write the artifact that a run learned as pictures and masks, and take it off photos where light came through."""
+    """Write the artifact that a run learned as pictures and masks, and remove it from photos where it lets light
+    through."""
 
     load_config: Path
     """The run's config.yml, wherever its folder is now; neither the photos nor a GPU are needed."""
     output: Path
     """Folder to write; must not exist."""
     raw_frame: bool = False
-    """Map everything back through the lens distortion to the frame of the original photos: what masks for COLMAP and
-    for nerfstudio's mask_path need. Otherwise: the undistorted frame that nerfstudio trains in."""
+    """Map everything through the lens distortion to the frame of the original photos, which masks for COLMAP and for
+    nerfstudio's mask_path need. Default: the undistorted frame that nerfstudio trains in."""
     threshold: float = 0.5
-    """Matte above which a pixel is artifact in the masks, in (0, 1). For structure from motion 0.2 is on the safe
-    side."""
+    """Matte above which a pixel is artifact in the masks, in (0, 1). For structure from motion 0.2 is safer."""
     step: int | None = None
     """Checkpoint to read; the newest where not given."""
     apply: Path | None = None
-    """Folder of photos, original or undistorted, at the trained or any other resolution: written without the artifact
-    to OUTPUT/photos, black where the matte is above 0.95."""
+    """Folder of photos, original or undistorted, at any resolution: written without the artifact to OUTPUT/photos,
+    black where the matte is above 0.95."""
     camera: int | None = None
     """For --apply with a rig: the camera whose photos these are, counted from 0 as in overlay.json."""
 
     def run(self) -> None:
-        """Read the checkpoint, write, and say what could not be recovered.
+        """Read the checkpoint, write, and print what could not be recovered.
 
         Raises:
-            InputError: the arguments, the checkpoint or a photo cannot be worked with.
+            InputError: an option, the checkpoint or a photo cannot be used.
         """
         if not 0 < self.threshold < 1:
             raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")

@@ -36,7 +36,7 @@ class Command:
         """Read the checkpoint and write.
 
         Raises:
-            InputError: the arguments or the checkpoint cannot be worked with.
+            InputError: an option or the checkpoint cannot be used.
         """
         box = self.obb_center, self.obb_rotation, self.obb_scale
         if any(box) and not all(box):

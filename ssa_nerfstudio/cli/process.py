@@ -13,8 +13,8 @@ from ssa_nerfstudio.errors import InputError
 class Command:
     """Make a nerfstudio dataset from photos or videos that all show the same artifact; COLMAP comes with pycolmap.
 
-    With --clean a capture in two passes: the photos of --train, which show the artifact, all train, and the clean ones
-    all test; both are registered in one frame. What is killed goes on where it was: run the same command again.
+    With --clean, a capture in two passes: the photos of --train, which show the artifact, train, and the clean ones
+    test; both are registered in one frame. An interrupted run is continued by the same command.
     """
 
     train: Path
@@ -24,34 +24,34 @@ class Command:
     clean: Path | None = None
     """Folder or video of the same scene without the artifact, to evaluate on."""
     mask: Path | None = None
-    """Picture of the raw frame's shape that tells where --train shows the artifact: black is ignored, all else is used,
-    which is COLMAP's and nerfstudio's polarity. Used for poses alone: training sees the whole photos."""
+    """Mask of the artifact in the photos of --train, of the raw frame's shape: black is ignored, all else used, as by
+    COLMAP and nerfstudio. Used for poses alone; training uses whole photos."""
     invert_mask: bool = False
-    """White marks the artifact in --mask instead."""
+    """The artifact is white in --mask instead."""
     detect: bool = False
-    """Detect where an opaque artifact is (see ssa detect) and mask it, where --mask is not given. What light
-    shines through is never masked: the scene behind it would be lost, too."""
+    """Detect an opaque artifact (see ssa detect) and mask it, where --mask is not given. Semi-transparent artifacts are
+    never masked: the scene behind them would be lost, too."""
     frames: int = 200
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighborhood."""
     min_registered: float = 0.5
-    """Stop when less than this share of a pass's photos could be registered."""
+    """Stop when less than this share of a pass's photos is registered."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
-    """All pairs of photos, or neighbors in time and a net over all; auto: all pairs up to 150 photos."""
+    """All pairs of photos, or neighbors in time and pairs of keyframes; auto: all pairs up to 150 photos."""
     flatten: bool = True
-    """Look for features in copies of the photos of --train that lack what is the same in all of them, where they
-    share anything; the dataset's photos stay as they are."""
+    """Extract features in copies of the photos of --train without their static factor (blind flat-field correction),
+    where they have one; the dataset's photos stay as they are."""
     filter_stationary: bool = True
-    """Drop matches that lie at the same place of both frames: what they match is in front of the lens."""
+    """Drop matches at the same place of both frames: they are on the artifact."""
     max_image_size: int = 1600
-    """Longest side of the photos that features are looked for in, pixels; the dataset's photos keep their size."""
+    """Longest side of the photos in which features are extracted, pixels; the dataset's photos keep their size."""
     threads: int = -1
-    """Threads; -1: one a core."""
+    """Number of threads; -1: one per core."""
 
     def run(self) -> None:
-        """Process, and say what was registered and what to do next.
+        """Process, and print what was registered and what to do next.
 
         Raises:
-            InputError: the arguments or files cannot be worked with, or too few photos were registered.
+            InputError: an option or a file cannot be used, or too few photos were registered.
         """
         from rich.console import Console
 

@@ -13,9 +13,9 @@ from ssa_nerfstudio.data.photos import UPRIGHT, exif_orientation, open_photo
 from ssa_nerfstudio.data.video import Video
 from ssa_nerfstudio.errors import InputError
 
-PHOTOS = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp"}
+PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".tiff", ".bmp"}
 """Suffixes of photos, in lower case."""
-VIDEOS = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts"}
+VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts"}
 """Suffixes of videos, in lower case."""
 _ON_THE_SIDE = {5, 6, 7, 8}
 
@@ -78,13 +78,13 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
         raise InputError(f"{path} does not exist", "give a folder of photos, a folder of videos or a video")
     files = [path] if path.is_file() else sorted(path.iterdir(), key=_natural)
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]
-    photos = [file for file in files if file.suffix.lower() in PHOTOS and path.is_dir()]
-    videos = [file for file in files if file.suffix.lower() in VIDEOS]
+    photos = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES and path.is_dir()]
+    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
     if photos:
         return _photos(path, name, min_photos, photos, videos)
     if videos:
         return _videos(path, name, videos)
-    known = ", ".join(sorted(suffix[1:] for suffix in PHOTOS | VIDEOS))
+    known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
     raise InputError(f"{path} holds no photo and no video ({known})", "put them there or name another folder")
 
 

@@ -1,4 +1,4 @@
-"""Frames of a video: evenly spaced, the sharpest of their neighborhood."""
+"""Frames of videos: evenly spaced, and the sharpest of their neighborhood."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from ssa_nerfstudio.errors import InputError
 
 _WINDOW = 0.5
-"""Share of the way from one chosen frame to the next that is searched for a sharp one: spacing varies 0.5 to 1.5."""
+"""Searched share of each part of the video; distances of chosen frames vary from 0.5 to 1.5 parts."""
 _SHARPNESS_WIDTH = 480
 
 
@@ -26,11 +26,11 @@ class Video:
     height: int
     """Of the upright frame, pixels."""
     frames: int
-    """Number of frames that its header states, at least 1."""
+    """Number of frames as the header states it, at least 1."""
 
     @classmethod
     def read(cls, path: Path) -> Video:
-        """Opens the video and decodes its first frame.
+        """Open a video and decode its first frame.
 
         Raises:
             InputError: it cannot be decoded.
@@ -48,15 +48,15 @@ class Video:
         return cls(path, frame.shape[1], frame.shape[0], frames)
 
     def sharpest(self, count: int) -> Iterator[tuple[int, np.ndarray]]:
-        """The sharpest frame in the middle half of each of `count` equal parts of the video.
+        """Choose the sharpest frame in the middle half of each of `count` equal parts of the video.
 
-        Decodes the video once and keeps one frame; a video of fewer frames gives them all.
+        Decodes the video once and keeps one frame in memory. A video of fewer frames yields them all.
 
         Args:
             count: at least 1.
 
         Yields:
-            Number of the frame, from 0, and the frame, BGR uint8 [height, width, 3], turned upright.
+            The frame's number, from 0, and the frame, BGR uint8 [height, width, 3], upright.
         """
         spacing = max(self.frames / count, 1.0)
         capture = cv2.VideoCapture(str(self.path))
@@ -81,7 +81,7 @@ class Video:
 
 
 def _sharpness(frame: np.ndarray) -> float:
-    """Variance of the Laplacian of the gray frame at a width of 480 pixels: motion blur lowers it, noise hardly counts.
+    """Variance of the Laplacian of the gray frame at a width of 480 pixels; motion blur lowers it, noise averages out.
 
     Pertuz et al. 2013, Analysis of focus measure operators for shape-from-focus.
     """

@@ -1,1 +1,1 @@
-"""What a training learned, as files: the artifact as pictures, photos without it, and the splats."""
+"""Export of a finished run: the artifact as pictures and masks, photos without it, and the splats."""

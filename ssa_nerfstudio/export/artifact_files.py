@@ -1,4 +1,4 @@
-"""The artifact as files: straight-alpha pictures, premultiplied layers, matte, masks and a description."""
+"""The artifact as files: straight-alpha images, premultiplied layers, matte, masks and a description."""
 
 from __future__ import annotations
 
@@ -27,16 +27,18 @@ FILES = {
     "mask_white_is_artifact.png": "the same mask inverted, for inpainting and editing tools",
     "preview.png": "the artifact over a checkerboard, to look at",
 }
-"""What `write_overlay` writes for each camera, and what it is."""
+"""Files that `write_overlay` writes for each camera, and what they hold."""
 LAYERS_FILE = "layers.npz"
 """T and B of all cameras in the undistorted frame: what `--pipeline.model.overlay-given` takes."""
 
 
 def write_overlay(folder: Path, checkpoint: Checkpoint, layers: list[ArtifactLayers], threshold: float) -> dict:
-    """Write every camera's artifact, and overlay.json; with several cameras each has a folder camera_0, camera_1, ...
+    """Write overlay.json and the artifact of every camera, of several in folders camera_0, camera_1, ...
 
     Args:
         folder: exists and is empty.
+        checkpoint: where the layers come from, for the description.
+        layers: one per camera.
         threshold: matte above which a pixel counts as artifact in the masks, in (0, 1).
 
     Returns:
@@ -71,9 +73,9 @@ def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dic
     straight = np.concatenate([color[..., ::-1], alpha], axis=-1)  # OpenCV's order
     _write_png(folder / "overlay.png", quantized(straight, np.uint8))
     _write_png(folder / "overlay_16bit.png", quantized(straight, np.uint16))
-    # Premultiplied, light that hides nothing has its place (unless T differs by channel): color above alpha.
-    hides = 1 - layers.transmittance.mean(axis=-1, keepdims=True)
-    np.save(folder / "overlay_premultiplied.npy", np.concatenate([layers.addition, hides], axis=-1))
+    # Premultiplied, additive light can be expressed (unless T differs by channel): as color above alpha.
+    coverage = 1 - layers.transmittance.mean(axis=-1, keepdims=True)
+    np.save(folder / "overlay_premultiplied.npy", np.concatenate([layers.addition, coverage], axis=-1))
     _write_png(folder / "matte.png", quantized(alpha, np.uint16))
     _write_png(folder / "mask_white_is_artifact.png", artifact.astype(np.uint8) * 255)
     _write_png(folder / "mask_white_is_scene.png", (~artifact).astype(np.uint8) * 255)
@@ -90,9 +92,9 @@ def _write_camera(folder: Path, layers: ArtifactLayers, threshold: float) -> dic
 
 
 def _lost(layers: ArtifactLayers, color: np.ndarray, alpha: np.ndarray) -> float:
-    """Mean over pixels of the error of the RGBA picture in front of the scene, black or white, where it is larger.
+    """Mean over pixels of the error of the RGBA image over a black or a white scene, whichever is larger.
 
-    T per channel, or light that hides nothing: no RGBA picture has that.
+    RGBA can express neither a transmittance per channel nor additive light.
     """
     black = alpha * color - layers.addition
     white = black + (1 - alpha) - layers.transmittance
@@ -100,7 +102,7 @@ def _lost(layers: ArtifactLayers, color: np.ndarray, alpha: np.ndarray) -> float
 
 
 def quantized(values: np.ndarray, kind: type[np.unsignedinteger]) -> np.ndarray:
-    """Values in [0, 1] as integers that use a type's whole range."""
+    """Map values in [0, 1] to the whole range of an unsigned integer type, rounded."""
     return np.rint(values.clip(0, 1) * np.float64(np.iinfo(kind).max)).astype(kind)
 
 

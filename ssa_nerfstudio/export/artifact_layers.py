@@ -1,4 +1,4 @@
-"""A trained artifact as layers T and B (I = T C + B) in the frame that is asked for: undistorted, raw, or enlarged."""
+"""A trained artifact as layers T and B (I = T C + B), in the undistorted or raw frame and at any resolution."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_matching import lens as lens_of
 
-_KNOWN = 0.999
-"""Weight of pixels of the undistorted frame in one of the raw frame: less is blended with what is not known."""
+_MIN_KNOWN_WEIGHT = 0.999
+"""Weight of known pixels from which a resampled pixel counts as known."""
 
 
 @dataclass(frozen=True)
 class ArtifactLayers:
-    """What one camera's artifact does to a photo."""
+    """The artifact of one camera."""
 
     transmittance: np.ndarray
     """T: float32 [H, W, 3] in [0, 1]."""
@@ -32,10 +32,10 @@ class ArtifactLayers:
     camera: Lens
     """Intrinsics of the frame that the layers are in."""
     frame: Literal["undistorted", "raw"]
-    """undistorted: the pixels that nerfstudio trains on; raw: those of the photos as they were taken."""
+    """undistorted: the frame that nerfstudio trains in; raw: that of the original photos."""
     kind: Literal["learned", "given"]
     known: np.ndarray | None = None
-    """bool [H, W]: False where the crop of the undistorted frame left nothing of the raw one; None: all is known."""
+    """bool [H, W]: False outside the cropped undistorted frame, where nothing was learned; None: all is known."""
 
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
         """Straight color W [H, W, 3] and matte A [H, W, 1], both in [0, 1]."""
@@ -43,9 +43,9 @@ class ArtifactLayers:
         return color.numpy(), alpha.numpy()
 
     def covered(self, threshold: float) -> np.ndarray:
-        """Where the matte exceeds the threshold, bool [H, W]; what is not known is as the nearest pixel that is.
+        """Pixels whose matte exceeds the threshold, bool [H, W]; unknown pixels are like the nearest known one.
 
-        A dashboard does not end where the undistorted frame does: structure from motion must not look there.
+        A dashboard does not end where the undistorted frame does, and structure from motion must not use it there.
         """
         covered = self.straight()[1][..., 0] > threshold
         if self.known is None or self.known.all():
@@ -56,7 +56,7 @@ class ArtifactLayers:
         return covered[y, x]
 
     def sized(self, width: int, height: int) -> ArtifactLayers:
-        """The same frame at another resolution, resampled bilinearly (reduced: by areas)."""
+        """Resample to another resolution: bilinearly, or by area where it is smaller."""
         if (width, height) == (self.camera.width, self.camera.height):
             return self
         across, down = width / self.camera.width, height / self.camera.height
@@ -73,7 +73,7 @@ class ArtifactLayers:
 
 
 def undistorted_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
-    """Every camera group's artifact in the frame it was trained in.
+    """Artifact of every camera group in the frame that it was trained in.
 
     Raises:
         InputError: the checkpoint has no overlay.
@@ -92,18 +92,18 @@ def undistorted_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
 
 
 def raw_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
-    """Every camera group's artifact in the frame of its original photos, through the lens distortion.
+    """Artifact of every camera group in the raw frame of its photos, through the lens distortion.
 
-    What the crop of the undistorted frame left out of the raw one is clear: nothing is known of it.
+    Outside the cropped undistorted frame the layers are clear and not known.
 
     Raises:
-        InputError: the checkpoint does not know its lenses, or nerfstudio cannot undistort them.
+        InputError: the checkpoint states no lenses, or nerfstudio cannot undistort them.
     """
     described = checkpoint.artifacts().lenses.tolist()
     if not described:
         raise InputError(
-            f"{checkpoint.path} was written before checkpoints kept their lenses: nothing leads to the raw frame",
-            "resume the run for one more step, or leave out --raw-frame",
+            f"{checkpoint.path} was written before checkpoints kept their lenses: the raw frame is not known",
+            "resume the run for one more step, or use the undistorted frame",
         )
     result = []
     for layers, row in zip(undistorted_layers(checkpoint), described, strict=True):
@@ -111,15 +111,15 @@ def raw_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
             lens = lens_of(row)
             target = undistorted_lens(lens)
         except ValueError as error:
-            raise InputError(f"{checkpoint.path}: {error}", "leave out --raw-frame") from error
+            raise InputError(f"{checkpoint.path}: {error}", "use the undistorted frame") from error
         if (target.width, target.height) != (layers.camera.width, layers.camera.height):
             raise InputError(
                 f"{checkpoint.path}: the overlay is {layers.camera.width} x {layers.camera.height}, its lens gives "
                 f"{target.width} x {target.height}",
-                "leave out --raw-frame",
+                "use the undistorted frame",
             )
         transmittance = distort(layers.transmittance, lens, 1.0)
         addition = distort(layers.addition, lens, 0.0)
-        known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > _KNOWN
+        known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > _MIN_KNOWN_WEIGHT
         result.append(ArtifactLayers(transmittance, addition, lens, "raw", layers.kind, known))
     return result

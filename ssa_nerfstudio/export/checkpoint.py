@@ -1,4 +1,4 @@
-"""A finished run, read from its checkpoint alone: no photo, no dataset and no GPU are needed."""
+"""A finished run, read from its checkpoint alone; photos, dataset and GPU are not needed."""
 
 from __future__ import annotations
 
@@ -32,26 +32,24 @@ class Checkpoint:
 
     @staticmethod
     def read(config: Path, step: int | None = None) -> Checkpoint:
-        """Read the checkpoint that stands beside a run's config.yml, wherever that folder has been moved.
+        """Read a checkpoint of a run from the folder beside its config.yml, which may have been moved.
 
         Args:
             config: the run's config.yml.
             step: which checkpoint; the newest where None.
 
         Raises:
-            InputError: there is none, or it is no checkpoint of Gaussian splats.
+            InputError: the checkpoint does not exist, cannot be read or holds no Gaussian splats.
         """
         if not config.is_file():
-            raise InputError(f"--load-config {config} does not exist", "give the config.yml that ns-train wrote")
+            raise InputError(f"{config} does not exist", "choose the config.yml that ns-train wrote")
         folder = config.parent / _MODELS_FOLDER
         found = {step_of(path): path for path in newest_first(folder)}
         if step is not None and step not in found:
             there = ", ".join(map(str, sorted(found))) or "none"
             raise InputError(f"{folder} has no checkpoint of step {step}", f"there are {there}")
         if not found:
-            raise InputError(
-                f"{folder} holds no step-*.ckpt", "give --load-config the config.yml of a run that saved one"
-            )
+            raise InputError(f"{folder} holds no step-*.ckpt", "choose the config.yml of a run that saved one")
         path = found[max(found) if step is None else step]
         allow_checkpoint_scalars()
         try:
@@ -65,7 +63,7 @@ class Checkpoint:
             ) from error
         model = {name.removeprefix(_MODEL): value for name, value in state.items() if name.startswith(_MODEL)}
         if "gauss_params.means" not in model:
-            raise InputError(f"{path} holds no Gaussian splats", "give a run of ssa-splatfacto or splatfacto")
+            raise InputError(f"{path} holds no Gaussian splats", "choose a run of ssa-splatfacto or splatfacto")
         return Checkpoint(path, at, model)
 
     def gaussians(self) -> dict[str, Tensor]:
@@ -83,7 +81,7 @@ class Checkpoint:
         prefix = "artifacts."
         if not len(self.model.get(f"{prefix}camera_keys", ())):
             raise InputError(
-                f"{self.path} has no overlay: it was trained with --pipeline.model.overlay off or by another method",
+                f"{self.path} has no overlay: it was trained with the overlay off or by another method",
                 "train it with ssa-splatfacto",
             )
         artifacts = Artifacts().eval()

@@ -1,4 +1,4 @@
-"""Photos without their artifact, where it let light through: C = (I - B) / T, which is (I - A W) / (1 - A)."""
+"""Photos restored where the artifact lets light through: C = (I - B) / T, which is (I - A W) / (1 - A)."""
 
 from __future__ import annotations
 
@@ -11,86 +11,84 @@ import numpy as np
 from PIL import Image
 
 from ssa_nerfstudio.data.photos import open_photo, read_photo, write_photo
+from ssa_nerfstudio.data.sources import PHOTO_SUFFIXES
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 
-LEAST_TRANSMITTANCE = 0.05
-"""A pixel whose matte exceeds 0.95 in any channel is not recovered: an error of one gray level would become twenty.
-Nor is one to which more than 0.95 of white was added: what a photo can still tell is less than that."""
-SAME_ASPECT = 0.005
-"""Photos whose aspect differs by less than this, relatively, may be the trained ones at another resolution."""
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
-"""Files of a folder that count as photos."""
+MIN_TRANSMITTANCE = 0.05
+"""Pixels of less transmittance in any channel are not recovered: an error of one gray level would become twenty. The
+same holds where the artifact adds more than 0.95 of white."""
+MAX_ASPECT_DIFFERENCE = 0.005
+"""Relative difference of aspect up to which photos count as the training photos at another resolution."""
 
 
 @dataclass(frozen=True)
 class Recovery:
-    """What became of one photo."""
+    """Statistics of one restored photo."""
 
     path: Path
     """Relative to the folder of photos."""
     hidden: float
-    """Fraction of pixels behind a matte above 0.95: not recovered, black."""
+    """Fraction of pixels that were not recovered and are black."""
     implausible: float
-    """Fraction of recovered pixels that came out darker than black or brighter than white by over two gray levels."""
+    """Fraction of recovered pixels that are darker than black or brighter than white by more than two gray levels."""
     clipped: float
-    """Fraction of pixels that are recovered as a lower bound: added light made the photo white."""
+    """Fraction of pixels that are lower bounds: added light saturated the photo."""
 
 
 def recoverable(layers: ArtifactLayers) -> np.ndarray:
-    """Where an artifact leaves enough of the scene in a photo, bool [H, W] (`LEAST_TRANSMITTANCE`)."""
-    return np.minimum(layers.transmittance, 1 - layers.addition).min(axis=-1) >= LEAST_TRANSMITTANCE
+    """Pixels in which an artifact leaves enough of the scene (`MIN_TRANSMITTANCE`), bool [H, W]."""
+    return np.minimum(layers.transmittance, 1 - layers.addition).min(axis=-1) >= MIN_TRANSMITTANCE
 
 
 def clipped(photo: np.ndarray, layers: ArtifactLayers) -> np.ndarray:
-    """Where a photo uint8 [H, W, 3] is white and need not be by the scene alone, bool [H, W]: I = clip(T C + B).
+    """Pixels of a photo uint8 [H, W, 3] that added light may have saturated, bool [H, W]: I = clip(T C + B).
 
-    An artifact of one picture, T = 1 - A and B = A W, never reaches beyond white.
+    An alpha-blended artifact, T = 1 - A and B = A W, never saturates a photo.
     """
     beyond = layers.transmittance + layers.addition > 1 + 0.5 / 255
     return ((photo == 255) & beyond).any(axis=-1)
 
 
 def restore(photo: np.ndarray, layers: ArtifactLayers) -> tuple[np.ndarray, np.ndarray, float]:
-    """Take an artifact off a photo.
+    """Remove an artifact from a photo.
 
     Args:
         photo: uint8 [H, W, 3].
         layers: of the photo's frame and size.
 
     Returns:
-        The photo uint8 [H, W, 3], black where hidden; what could be recovered, bool [H, W]; and the fraction of it
-        that is implausible.
+        The photo uint8 [H, W, 3], black where not recovered; the recovered pixels, bool [H, W]; and the fraction of
+        them that is implausible.
     """
     seen = recoverable(layers)
     scene = photo - np.float32(255) * layers.addition
-    scene /= np.maximum(layers.transmittance, np.float32(LEAST_TRANSMITTANCE))
+    scene /= np.maximum(layers.transmittance, np.float32(MIN_TRANSMITTANCE))
     wrong = ((scene < -2) | (scene > 257)).any(axis=-1) & seen
     scene[~seen] = 0
     return np.rint(scene).clip(0, 255).astype(np.uint8), seen, float(wrong.sum() / max(1, seen.sum()))
 
 
 def find_photos(folder: Path) -> list[Path]:
-    """The photos below a folder, sorted.
+    """Find the photos in a folder and its subfolders, sorted.
 
     Raises:
         InputError: there are none.
     """
     if not folder.is_dir():
-        raise InputError(f"--apply {folder} is no folder", "give the folder of the photos")
-    photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in SUFFIXES)
+        raise InputError(f"{folder} is no folder", "choose the folder of the photos")
+    photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
     if not photos:
-        raise InputError(
-            f"--apply {folder} holds no photos ({', '.join(sorted(SUFFIXES))})", "give the folder of the photos"
-        )
+        suffixes = ", ".join(sorted(PHOTO_SUFFIXES))
+        raise InputError(f"{folder} holds no photos ({suffixes})", "choose the folder of the photos")
     return photos
 
 
 def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
-    """The layers of a photo's frame, at its size: of the same size first, else of the same aspect, enlarged.
+    """Find the layers that fit a photo: of its size, else of its aspect, resampled to its size.
 
     Args:
-        path: the photo, of which only the header is read.
+        path: the photo; only its header is read.
         frames: layers to choose from, those of raw frames first.
 
     Raises:
@@ -103,25 +101,26 @@ def fitting(path: Path, frames: list[ArtifactLayers]) -> ArtifactLayers:
             return layers
     for layers in frames:
         trained = layers.camera.width / layers.camera.height
-        if abs(width / height / trained - 1) < SAME_ASPECT:
+        if abs(width / height / trained - 1) < MAX_ASPECT_DIFFERENCE:
             return layers.sized(width, height)
     sizes = ", ".join(f"{f.camera.width} x {f.camera.height} ({f.frame})" for f in frames)
     raise InputError(
-        f"{path} is {width} x {height}, the overlay's frame {sizes}", "give photos of the camera it was trained on"
+        f"{path} is {width} x {height}, the overlay's frame {sizes}",
+        "choose photos of the camera that it was trained on",
     )
 
 
 def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers], output: Path) -> Iterator[Recovery]:
-    """Take the artifact off photos and write them as PNG, each under its own name, with a mask for every size.
+    """Remove the artifact from photos and write them as PNG, with a mask for every size of photo.
 
     Args:
-        folder: what the photos' places in `output` are relative to.
+        folder: paths in `output` are the photos' paths relative to this folder.
         photos: from `find_photos`.
         frames: layers to choose from, those of raw frames first.
         output: folder to write into; `photos/` and, per size, `mask_white_is_scene_WxH.png` (black: not recovered).
 
     Yields:
-        What became of each photo, in order.
+        Statistics of each photo, in order.
 
     Raises:
         InputError: a photo is unreadable or of another frame.
@@ -136,7 +135,7 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
             output.mkdir(parents=True, exist_ok=True)
             Image.fromarray(seen.astype(np.uint8) * 255).save(output / name)
 
-    def one(path: Path) -> Recovery:
+    def restore_one(path: Path) -> Recovery:
         layers = sized[path]
         photo = read_photo(path, (layers.camera.width, layers.camera.height))
         clean, seen, implausible = restore(photo, layers)
@@ -146,4 +145,4 @@ def restore_photos(folder: Path, photos: list[Path], frames: list[ArtifactLayers
         return Recovery(path.relative_to(folder), float(1 - seen.mean()), implausible, lower_bound)
 
     with ThreadPoolExecutor(2) as pool:
-        yield from pool.map(one, photos)
+        yield from pool.map(restore_one, photos)

@@ -1,4 +1,4 @@
-"""Photos, decoded and undistorted once and kept; cameras prepared once, so that a training step only picks one."""
+"""Photos are decoded, undistorted and cached once; cameras are prepared once, so that a step only picks one."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class SSADatamanagerConfig(FullImageDatamanagerConfig):
 
 
 class SSADatamanager(FullImageDatamanager[PhotoDataset]):
-    """`FullImageDatamanager` that also works without CUDA, names unreadable files, and prepares its cameras once."""
+    """`FullImageDatamanager` that also works without CUDA, decodes by `PhotoDataset`, and prepares its cameras once."""
 
     config: SSADatamanagerConfig
     _train_views: list[Cameras] | None = None

@@ -279,7 +279,7 @@ def test_a_checkpoint_of_the_first_version_is_still_read(tmp_path, capsys):
     assert (tmp_path / "out" / "overlay.png").read_bytes() == (tmp_path / "of-new" / "overlay.png").read_bytes()
     with pytest.raises(SystemExit):
         export(old_run(tmp_path / "run"), tmp_path / "raw", "--raw-frame")
-    assert "leave out --raw-frame" in capsys.readouterr().err
+    assert "use the undistorted frame" in capsys.readouterr().err
     assert not (tmp_path / "raw").exists()
 
 
