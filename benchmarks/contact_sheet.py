@@ -1,12 +1,15 @@
-"""All effects on the demo's scene as one picture: `python benchmarks/contact_sheet.py FILE.png`."""
+"""All effects on the built-in scene as one picture: `python benchmarks/contact_sheet.py FILE.png`"""
 
 from __future__ import annotations
 
-import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
+import tyro
 from PIL import Image, ImageDraw, ImageFont
 
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
@@ -19,14 +22,14 @@ _CAPTION = 18
 
 
 def contact_sheet(scene: DemoScene, seed: int = 0) -> Image.Image:
-    """A clean view, then every effect in front of it; of the effects that vary a second view follows.
+    """Draw a clean view and every effect over it; effects that vary are drawn over a second view, too.
 
     Args:
-        scene: its first and second training view are shown.
+        scene: its first two training views are drawn.
         seed: of the effects.
 
     Returns:
-        A picture of 256 colors, four tiles of half the frame's size a row.
+        A picture of 256 colors, four tiles of half the frame's size in a row.
     """
     photos = [scene.render(pose) for pose in scene.cameras[0][:2]]
     tiles = [("clean", photos[0])]
@@ -48,17 +51,24 @@ def contact_sheet(scene: DemoScene, seed: int = 0) -> Image.Image:
     return sheet.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG)
 
 
-def main(arguments: list[str]) -> None:
-    """Write the contact sheet to the one file named.
+@dataclass
+class Command:
+    """Draw all effects on the built-in scene as one picture."""
 
-    Raises:
-        InputError: not exactly one .png file is named.
-    """
-    if len(arguments) != 1 or Path(arguments[0]).suffix != ".png":
-        raise InputError("name one .png file to write: python -m benchmarks.contact_sheet FILE.png")
-    sheet = contact_sheet(DemoScene(views=2, test_views=1, width=_FRAME[0], height=_FRAME[1]))
-    sheet.save(arguments[0], optimize=True)
+    file: Annotated[Path, tyro.conf.Positional]
+    """PNG file to write, in a folder that exists."""
+
+    def run(self) -> None:
+        """Write the contact sheet.
+
+        Raises:
+            InputError: the file is no .png, or its folder does not exist.
+        """
+        if self.file.suffix != ".png" or not self.file.parent.is_dir():
+            raise InputError(f"{self.file} cannot be written", "name a .png file in a folder that exists")
+        sheet = contact_sheet(DemoScene(views=2, test_views=1, width=_FRAME[0], height=_FRAME[1]))
+        sheet.save(self.file, optimize=True)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(Command)

@@ -1,7 +1,7 @@
-"""Does MCMC diverge behind an artifact, when, and by which parameter? `python benchmarks/divergence.py`
+"""Whether and when MCMC diverges behind an artifact, and which parameter does: `python benchmarks/divergence.py`
 
-Trains the same dataset four times, with the overlay and the guards off and on, writes a JSON file for each and draws
-those in the folder: the largest scale, the share of living Gaussians and the norm of all gradients over the steps.
+The same dataset is trained four times, with the overlay and the guards off and on. Each run gets a JSON file; the files
+of the folder are plotted: the largest scale, the share of living Gaussians and the norm of all gradients by step.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils import writer
 
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.training_run import configure, versions
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 ALIVE = 0.005
-"""Opacity above which a Gaussian lives (MCMC's smallest)."""
+"""Opacity above which a Gaussian is alive (MCMC's smallest)."""
 PANELS = {"largest scale": "world units", "alive share": "of all Gaussians", "gradient norm": "2-norm of all gradients"}
 
 
 @dataclass
 class Command:
-    """Train four times and plot."""
+    """Train with MCMC, with and without overlay and guards, and plot how each run went."""
 
     data: Path
     """A nerfstudio dataset with an artifact in front (`ssa simulate --effects dashboard`)."""
@@ -40,7 +40,7 @@ class Command:
     overlay: tuple[Literal["off", "on"], ...] = ("off", "on")
     """Overlays to train with; several processes, one a GPU, can share the four trainings and the folder."""
     guards: tuple[bool, ...] = (False, True)
-    """Guards to train with."""
+    """Whether to train with guards."""
     steps: int = 15_000
     """Training steps of each run; schedules are scaled to them."""
     cap_max: int = 300_000
@@ -48,7 +48,7 @@ class Command:
     scale_factor: float = 1.0
     """Photos are resized by this."""
     every: int = 10
-    """Steps between two notes."""
+    """Steps between two recorded values."""
 
     def run(self) -> None:
         """Train, write, draw."""
@@ -84,7 +84,7 @@ class Command:
             alive = (torch.sigmoid(params["opacities"]) > ALIVE).float().mean()
             notes.append(torch.stack([params["scales"].max().exp(), alive, squares.sum().sqrt(), *finite]))
 
-        # Before the densification, which puts new parameters without gradients in the place of these.
+        # Before the densification, which replaces these parameters by new ones without gradients.
         trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
         failure = None
         try:
@@ -133,4 +133,4 @@ def draw(runs: list[dict[str, Any]], path: Path) -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(Command).run()
+    run_script(Command)

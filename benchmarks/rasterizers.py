@@ -1,8 +1,8 @@
-"""Do the rasterizers draw the same picture, and how fast? `python benchmarks/rasterizers.py`
+"""Accuracy and speed of the rasterizers: `python benchmarks/rasterizers.py`
 
-Compares image, alpha, expected depth and every gradient of each body on this machine with `reference` in float64, on
-Gaussians like those of a trained scene, and times forward + backward. On a CUDA machine gsplat's own `rasterization` is
-compared too. Errors are relative in the 2-norm: |a - b| / |b|.
+Image, alpha, expected depth and every gradient of each implementation on this machine are compared with `reference` in
+float64, on Gaussians like those of a trained scene; forward + backward is timed. On a CUDA machine gsplat's own
+`rasterization` is compared, too. Errors are relative in the 2-norm: |a - b| / |b|.
 """
 
 from __future__ import annotations
@@ -10,21 +10,25 @@ from __future__ import annotations
 import importlib.util
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from importlib.metadata import version
 
 import torch
 from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
+from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.rasterization import rasterizer, reference
 from ssa_nerfstudio.rasterization.interface import Gaussians, RenderOptions
 from ssa_nerfstudio.rasterization.projection import project
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "colors")
-"""What a Gaussian consists of, in the order of the rasterizers' arguments."""
+"""Parameters of a Gaussian, in the order of the rasterizers' arguments."""
 Scene = tuple[dict[str, Tensor], Tensor, Tensor]
-"""Parameters as `rasterization` takes them, viewmats [C, 4, 4], Ks [C, 3, 3]."""
+"""Arguments of `rasterization`: parameters by name, viewmats [C, 4, 4], Ks [C, 3, 3]."""
 OPTIONS = RenderOptions(
     near_plane=0.01,
     far_plane=1e10,
@@ -80,7 +84,7 @@ def draw(
     height: int,
     **options,
 ) -> dict[str, Tensor]:
-    """Render RGB and expected depth, and pull fixed random cotangents back: everything a body computes, by name."""
+    """Render RGB and expected depth and backpropagate fixed random cotangents: every output and gradient by name."""
     leaves = {name: value.detach().clone().requires_grad_() for name, value in gaussians.items()}
     options = {"sh_degree": 3, "render_mode": "RGB+ED", "packed": False, **options}
     render, alpha, info = rasterization(**leaves, viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
@@ -109,7 +113,7 @@ def relative_error(a: Tensor, b: Tensor) -> float:
 
 
 def bodies() -> dict[str, tuple[Callable, str, torch.dtype]]:
-    """The bodies that this machine has (numba for `cpu`, CUDA for gsplat): name to (function, device, dtype)."""
+    """Implementations on this machine (numba for `cpu`, CUDA for gsplat): name to (function, device, dtype)."""
     found = {}
     if importlib.util.find_spec("numba"):
         splatter = rasterizer("cpu", "cpu")
@@ -123,7 +127,7 @@ def bodies() -> dict[str, tuple[Callable, str, torch.dtype]]:
 
 
 def compare(n: int, width: int, height: int, size: float) -> Table:
-    """Every body against `reference` in float64: one column each, one row for each result."""
+    """Compare implementations with `reference` in float64: a column for each, a row for each result."""
     scene = random_scene(n, width, height, size, torch.float64)
     oracle = draw(reference.rasterization, *scene, width, height)
     table = Table(title=f"relative error against reference in float64: {n} Gaussians, {width} x {height}")
@@ -140,7 +144,7 @@ def compare(n: int, width: int, height: int, size: float) -> Table:
 
 
 def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10) -> Table:
-    """Median milliseconds of forward + backward, and their ratio to projection + SH + autograd alone ("floor")."""
+    """Time forward + backward: median milliseconds, and their ratio to projection + SH + autograd alone ("floor")."""
     scene = random_scene(n, width, height, size)
 
     runs: dict[str, Callable] = {"floor": partial(floor, *scene, width, height)}
@@ -149,7 +153,7 @@ def time_bodies(n: int, width: int, height: int, size: float, repeats: int = 10)
             runs[name] = partial(draw, rasterization, *_moved(scene, device, dtype), width, height)
     runs["reference"] = partial(draw, reference.rasterization, *scene, width, height)
     seconds: dict[str, list[float]] = {name: [] for name in runs}
-    for repeat in range(repeats + 2):  # interleaved, so that a busy machine slows all alike; two rounds warm up
+    for repeat in range(repeats + 2):  # interleaved, so that a busy machine slows all alike; the first two warm up
         for name, run in runs.items():
             if name == "reference" and repeat > 3:
                 continue
@@ -172,16 +176,31 @@ def _moved(scene: Scene, device: str, dtype: torch.dtype) -> Scene:
     return {k: v.to(device, dtype) for k, v in gaussians.items()}, viewmats.to(device, dtype), Ks.to(device, dtype)
 
 
-def main() -> None:
-    """Print both tables with versions."""
-    from importlib.metadata import version
+@dataclass
+class Command:
+    """Compare the rasterizers of this machine with the reference in float64, and time them."""
 
-    console = Console(width=140)
-    device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
-    console.print(f"{device}, torch {torch.__version__}, gsplat {version('gsplat')}")
-    console.print(compare(2_000, 160, 120, 0.03))
-    console.print(time_bodies(10_000, 256, 256, 0.012))
+    compared: int = 2_000
+    """Gaussians of the comparison, in 160 x 120 pixels."""
+    timed: int = 10_000
+    """Gaussians of the timing, in 256 x 256 pixels."""
+    repeats: int = 10
+    """Rounds of the timing, of which the median counts."""
+
+    def run(self) -> None:
+        """Print both tables with versions.
+
+        Raises:
+            InputError: a number is below 1.
+        """
+        if min(self.compared, self.timed, self.repeats) < 1:
+            raise InputError("--compared, --timed and --repeats must be at least 1")
+        console = Console(width=140)
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+        console.print(f"{device}, torch {torch.__version__}, gsplat {version('gsplat')}")
+        console.print(compare(self.compared, 160, 120, 0.03))
+        console.print(time_bodies(self.timed, 256, 256, 0.012, self.repeats))
 
 
 if __name__ == "__main__":
-    main()
+    run_script(Command)

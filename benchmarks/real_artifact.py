@@ -1,8 +1,8 @@
-"""What is learned of a real artifact: `python benchmarks/real_artifact.py --data dashcam_hood`.
+"""Learned matte of a real artifact against its mask: `python benchmarks/real_artifact.py --data dashcam_hood`
 
-There are no clean views to compare with, only an approximate mask of the artifact in the raw frame, white where it is.
-The matte is held against it in the undistorted frame, and its mean over the upper third of the frame is told: a sky
-that hardly changes from view to view, and which an overlay must not swallow.
+There are no clean views to compare with, only an approximate mask of the artifact in the raw frame, white on the
+artifact. It is compared in the undistorted frame. The mean matte of the frame's upper third is printed, too: there is
+sky, which hardly changes from view to view and must not become artifact.
 """
 
 from __future__ import annotations
@@ -10,24 +10,26 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-import tyro
 from PIL import Image
 
 from ssa_nerfstudio.cameras.lens import undistort
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.runs.training_run import configure, model_settings, train_and_evaluate
 from ssa_nerfstudio.metrics.matte import matte_iou
 
 MASK = "artifact_mask_approx.png"
-"""The mask's name in the dataset."""
+"""Name of the mask in the dataset."""
 
 
 def undistorted_mask(data: Path, size: tuple[int, int]) -> torch.Tensor:
-    """The mask of the artifact in the frame that the model sees, [H, W] bool, at its resolution.
+    """Read the mask of the artifact in the undistorted frame, [H, W] bool, at the training's resolution.
 
     Args:
         data: dataset that holds `MASK`, with one camera.
@@ -41,12 +43,12 @@ def undistorted_mask(data: Path, size: tuple[int, int]) -> torch.Tensor:
 
 @dataclass
 class Command:
-    """Train on a capture with a real artifact, and print one row of figures of the matte."""
+    """Train on a capture with a real artifact, and print one line of metrics of the matte."""
 
     data: Path
     """A nerfstudio dataset with artifact_mask_approx.png."""
-    method: str = "ssa-splatfacto"
-    """ssa-splatfacto, ssa-splatfacto-mcmc or ssa-splatfacto-paper."""
+    method: Literal["ssa-splatfacto", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"] = "ssa-splatfacto"
+    """Method to train with."""
     steps: int = 30_000
     """Training steps; every schedule is scaled to them."""
     scale_factor: float = 1.0
@@ -55,7 +57,13 @@ class Command:
     """Settings of the model as name=value, for example overlay_start=statistics."""
 
     def run(self) -> None:
-        """Train and print."""
+        """Train and print.
+
+        Raises:
+            InputError: the dataset has no mask, or cannot be trained on.
+        """
+        if not (self.data / MASK).is_file():
+            raise InputError(f"{self.data / MASK} does not exist", "name a dataset with a mask of its artifact")
         model = model_settings(self.settings)
         with tempfile.TemporaryDirectory() as scratch:
             config = configure(self.method, self.data, Path(scratch), self.steps, model, self.scale_factor)
@@ -72,4 +80,4 @@ class Command:
 
 
 if __name__ == "__main__":
-    tyro.cli(Command).run()
+    run_script(Command)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import importlib
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from ssa_nerfstudio._system import terminal_messages
 from ssa_nerfstudio.errors import InputError, SSAError
@@ -41,14 +43,35 @@ def main(arguments: list[str] | None = None) -> None:
 
         print(__version__)
         return
+    with _errors_in_one_line(f"ssa {name}"):
+        _run(name, rest)
+
+
+def run_script(command: type) -> None:
+    """Run a script that is no command of `ssa` as if it were one: the same options, errors and exit codes.
+
+    Args:
+        command: a dataclass with a method `run`; its docstring is the first line of --help.
+    """
+    import inspect
+
+    from ssa_nerfstudio.cli import arguments
+
+    program = f"python {sys.argv[0]}"
+    with _errors_in_one_line(program):
+        arguments.read(command, sys.argv[1:], program, inspect.getdoc(command) or "").run()
+
+
+@contextmanager
+def _errors_in_one_line(program: str) -> Iterator[None]:
     terminal_messages.show_warnings()
     warnings.simplefilter("ignore", FutureWarning)  # raised by libraries at import; no user can act on them
     try:
-        _run(name, rest)
+        yield
     except SSAError as error:
         raise SystemExit(terminal_messages.print_error(error)) from None
     except KeyboardInterrupt as interrupt:
-        print(str(interrupt) or f"ssa {name} was stopped", file=sys.stderr)
+        print(str(interrupt) or f"{program} was stopped", file=sys.stderr)
         raise SystemExit(terminal_messages.INTERRUPTED_EXIT_CODE) from None
 
 

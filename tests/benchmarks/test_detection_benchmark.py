@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from benchmarks.detection import Command, detections, rates, spread, stretches
+from benchmarks.detection_rates import Command, detections, rates, spread, stretches
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 

@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 
-from benchmarks import divergence, guards
+from benchmarks import divergence, guard_cost
 
 
 def test_divergence_is_noted_for_each_of_four_runs_and_drawn(tiny_scene, tmp_path):
@@ -39,14 +39,14 @@ def test_a_parameter_that_breaks_is_named_with_its_step(tiny_scene, tmp_path, mo
 
 @pytest.mark.parametrize("overlay", ["on", "off"])
 def test_the_cost_of_the_guards_is_printed_with_its_interval(tiny_scene, capsys, overlay):
-    guards.Command(data=tiny_scene, overlay=overlay, grow=20, pairs=3).run()
+    guard_cost.Command(data=tiny_scene, overlay=overlay, grow=20, pairs=3).run()
     line = capsys.readouterr().out.strip().splitlines()[-1]
     assert "ms a step without guards; with them" in line
     assert "95 %" in line
 
 
 def test_guards_that_are_switched_off_guard_nothing_and_switched_on_again_they_do(tiny_scene, tmp_path):
-    training = guards.Command(data=tiny_scene, overlay="on")._training(tmp_path)
+    training = guard_cost.Command(data=tiny_scene, overlay="on")._training(tmp_path)
     parameters = training.trainer.pipeline.model.gauss_params
     for guarded in (True, False, True):
         before = {name: values.detach().clone() for name, values in parameters.items()}

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from benchmarks.detection import detections, stretches
+from benchmarks.detection_rates import detections, stretches
 from benchmarks.real_artifact import undistorted_mask
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.data.dataset import Dataset

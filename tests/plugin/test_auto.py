@@ -14,7 +14,7 @@ from conftest import edit_transforms
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
 
-from benchmarks.guards import Training
+from benchmarks.guard_cost import Training
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin import overlay_setup as first_look
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from benchmarks import screenshots
+from benchmarks import viewer_screenshots
 from ssa_nerfstudio.export.checkpoint import Checkpoint
 from ssa_nerfstudio.overlay.layer import letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
@@ -27,13 +27,13 @@ def config(tiny_scene, tmp_path_factory, configure_training, train_and_evaluate)
 
 @pytest.fixture(scope="module")
 def page(config) -> Iterator:
-    if screenshots.find_chromium() is None:
+    if viewer_screenshots.find_chromium() is None:
         pytest.skip("no Chromium on this machine; Debian: apt install chromium")
     pytest.importorskip("playwright.sync_api", reason="no playwright; pip install playwright")
     command = "ns-viewer", "--load-config", config
     with (
-        screenshots.browser() as browser,
-        screenshots.viewer_page(browser, *command, width=900, height=500) as page,
+        viewer_screenshots.browser() as browser,
+        viewer_screenshots.viewer_page(browser, *command, width=900, height=500) as page,
     ):
         yield page
 

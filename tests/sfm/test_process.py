@@ -16,7 +16,7 @@ from PIL import Image
 from plyfile import PlyData
 from small_captures import HEIGHT, WIDTH, poses, write
 
-from benchmarks.alignment import center_errors
+from benchmarks.sfm_accuracy import center_errors
 from ssa_nerfstudio.cli import main
 
 VIEWS = 16

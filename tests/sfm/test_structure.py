@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from small_captures import HEIGHT, WIDTH, poses, write
 
-from benchmarks.alignment import center_errors, similarity
+from benchmarks.sfm_accuracy import center_errors, similarity
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.sfm.photos_to_dataset import process
 from ssa_nerfstudio.sfm.reconstruction import MODEL, Pass, SfmSettings

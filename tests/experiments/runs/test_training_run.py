@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.guards import Training
+from benchmarks.guard_cost import Training
 from ssa_nerfstudio.experiments.benchmark.execution.artifact_scores import score, true_layers
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.runs.training_run import Diverged, configure, model_settings, train_and_evaluate

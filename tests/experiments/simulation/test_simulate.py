@@ -15,7 +15,7 @@ import yaml
 from PIL import Image
 from small_datasets import contents, edit, pixels, write_dataset
 
-from benchmarks.simulator import measure
+from benchmarks.simulator_speed import measure
 from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.data.dataset import Dataset

@@ -1,7 +1,8 @@
-"""Milliseconds of one training step, of splatfacto and of ours: `python benchmarks/steps.py --data DIR`
+"""Milliseconds of one training step, splatfacto's and ours: `python benchmarks/step_time.py --data DIR`
 
-Full resolution, schedules unscaled, the whole body of nerfstudio's training loop, steps 700 to 1099 of one process; the
-device is waited for at both ends only. Run the methods in turn, several times: a machine drifts more than they differ.
+Full resolution, unscaled schedules, the whole body of nerfstudio's training loop, steps 700 to 1099 of one process; the
+device is synchronized at both ends only. Run the methods in turn, several times: a machine drifts more than they
+differ.
 """
 
 from __future__ import annotations
@@ -12,35 +13,42 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
-import tyro
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils import writer
 
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.experiments.runs.training_run import METHODS
+from ssa_nerfstudio.plugin.validation import check_transforms
 
 FIRST, LAST = 699, 1099
-"""Steps between which the time is taken: after Triton's compilation, and after the first refinement, at step 600, which
-takes 150 ms to load its kernels."""
+"""Steps between which the time is taken: after Triton's compilation and the first refinement, at step 600, which takes
+150 ms to load its kernels."""
 
 
 @dataclass
 class Command:
-    """Time one method."""
+    """Time the training steps of one method."""
 
     data: Path
     """A nerfstudio dataset."""
-    method: str = "ssa-splatfacto"
-    """splatfacto, or one of this plugin's."""
-    overlay: str = "on"
-    """on or off; nothing to splatfacto."""
+    method: Literal["splatfacto", "ssa-splatfacto", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"] = "ssa-splatfacto"
+    """Method to time."""
+    overlay: Literal["on", "off"] = "on"
+    """Whether the method learns an overlay; splatfacto has none."""
 
     def run(self) -> None:
-        """Train 1100 steps and print one line."""
+        """Train 1100 steps and print one line.
+
+        Raises:
+            InputError: the dataset cannot be trained on.
+        """
+        check_transforms(self.data)
         config = copy.deepcopy((all_methods | METHODS)[self.method])
         config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", LAST + 1, 10 * LAST
         config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
@@ -62,7 +70,7 @@ class Command:
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         trainer.config.viewer.quit_on_train_completion = True
-        writer.EVENT_WRITERS.clear()  # tensorboard's, which splatfacto's default, the viewer, does without
+        writer.EVENT_WRITERS.clear()  # tensorboard's; splatfacto's default, the viewer, has none
         times: dict[int, float] = {}
 
         def note(step: int) -> None:
@@ -80,4 +88,4 @@ class Command:
 
 
 if __name__ == "__main__":
-    tyro.cli(Command).run()
+    run_script(Command)

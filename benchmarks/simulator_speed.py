@@ -1,7 +1,6 @@
-"""How fast is `ssa simulate`, against decoding and encoding the same photos?
+"""Speed of `ssa simulate` beside decoding and encoding its photos: `python benchmarks/simulator_speed.py --data DIR`
 
-The bare rate is that of reading every training photo and writing it as PNG, with the same code and the same number of
-threads, in the same run. `python benchmarks/simulator.py --data DIR` prints one row an effect.
+The bare rate is that of reading every training photo and writing it as PNG, with the same code and as many threads.
 """
 
 from __future__ import annotations
@@ -14,8 +13,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
+from rich.console import Console
+from rich.table import Table
+
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.photos import write_photo
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
@@ -24,12 +28,12 @@ from ssa_nerfstudio.experiments.simulation.simulator import simulate
 def measure(
     dataset: Dataset, effect: str, threads: int, repeats: int, clock: Callable[[], float] = time.perf_counter
 ) -> tuple[float, float]:
-    """Times the bare round trip and the simulator in turns, so that a busy machine slows both alike.
+    """Time the bare round trip and the simulator in turns, so that a busy machine slows both alike.
 
     Args:
-        dataset: its training photos are worked on.
+        dataset: its training photos are used.
         effect: name of the one effect.
-        threads: photos worked on at once.
+        threads: photos in flight at once.
         repeats: turns, at least 1.
         clock: seconds.
 
@@ -69,15 +73,18 @@ class Command:
     effects: tuple[str, ...] = tuple(EFFECTS)
     """Effects to time, each alone."""
     threads: int = 2
-    """Photos worked on at once."""
+    """Photos in flight at once, at least 1."""
     repeats: int = 3
-    """Turns, of which the median counts."""
+    """Turns, at least 1, of which the median counts."""
 
     def run(self) -> None:
-        """Print the table."""
-        from rich.console import Console
-        from rich.table import Table
+        """Print a row for each effect.
 
+        Raises:
+            InputError: a number is below 1, or the dataset or an effect cannot be used.
+        """
+        if min(self.threads, self.repeats) < 1:
+            raise InputError("--threads and --repeats must be at least 1")
         dataset = Dataset.read(self.data, eval_interval=8)
         count = len(dataset.split[0])
         height, width = dataset.views[0].size
@@ -91,6 +98,4 @@ class Command:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    tyro.cli(Command).run()
+    run_script(Command)

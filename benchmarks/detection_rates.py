@@ -1,8 +1,7 @@
-"""How often does detection find an artifact, and how often one that is not there?
+"""How often detection finds an artifact, and how often one that is not there: `python benchmarks/detection_rates.py`
 
-`python benchmarks/detection.py --data DIR DIR ...` puts each effect in front of the raw photos of each
-capture, with several seeds and numbers of views, and prints one row a capture and effect. With `--contiguous` the views
-are neighbors, as in a short clip, where a scene has had least time to move.
+Each effect is put in front of the raw photos of each capture, with several seeds and numbers of views; there is a row
+for each capture and effect. With `--contiguous` views are neighbors, as in a short clip, where parallax is smallest.
 """
 
 from __future__ import annotations
@@ -18,7 +17,9 @@ from rich.console import Console
 from rich.progress import track
 
 from ssa_nerfstudio.cameras.lens import undistort
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset, View
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.experiments.effects.composition import Composition
@@ -36,13 +37,13 @@ def stretches(total: int, count: int) -> list[set[int]]:
 
 
 def detections(dataset: Dataset, effect: str | None, seed: int, chosen: list[set[int]]) -> list[Detection]:
-    """Detect with some of a capture's views, a new statistics for each choice in one pass.
+    """Detect an artifact in several subsets of a capture's views, in one pass over its photos.
 
     Args:
         dataset: all its photos are clean and of one size.
-        effect: what to put in front; None: nothing.
+        effect: name of the effect to put in front, or None.
         seed: of the effect, and of detection's shifts.
-        chosen: numbers of the views, from 0, of each choice.
+        chosen: for each subset the numbers of its views, from 0.
     """
     views = dataset.views
     scene = Scene(read_effects((effect,)), seed) if effect else None
@@ -63,8 +64,11 @@ def detections(dataset: Dataset, effect: str | None, seed: int, chosen: list[set
 def rates(
     dataset: Dataset, repeats: int, clock: Callable[[], float] = time.process_time
 ) -> tuple[float, float, float, float]:
-    """Medians over interleaved turns, seconds of CPU time for all photos: decode and undistort; statistics and blocks;
-    the blocks of brightness alone; the test at the end."""
+    """Time detection; medians over interleaved turns of the CPU seconds for all photos.
+
+    Returns:
+        Decoding and undistorting; statistics and blocks; the blocks of brightness alone; the test at the end.
+    """
     turns = []
     for _ in range(repeats):
         statistics, seconds = ImageStatistics(), np.zeros(4)
@@ -95,7 +99,7 @@ def _behind(scene: Scene, artifact: Composition, photo: np.ndarray, number: int)
 
 @dataclass
 class Command:
-    """Hits and false alarms of detection on clean captures and behind simulated artifacts."""
+    """Count detection's hits and false alarms, on captures as they are and behind simulated artifacts."""
 
     data: tuple[Path, ...]
     """Clean nerfstudio datasets."""
@@ -104,14 +108,20 @@ class Command:
     views: tuple[int, ...] = (12, 25, 50)
     """Numbers of views; 0 for all, unless contiguous."""
     contiguous: bool = False
-    """Views that are neighbors: the first, the middle and the last so many. Otherwise spread evenly."""
+    """Take neighboring views, from the beginning, the middle and the end, instead of evenly spread ones."""
     seeds: int = 5
-    """Draws of each effect and of detection's shifts."""
+    """Seeds of each effect and of detection's shifts, at least 1."""
     rate: bool = False
-    """Measure instead what detection costs beside decoding and undistorting."""
+    """Measure the time of detection instead, beside that of decoding and undistorting."""
 
     def run(self) -> None:
-        """Print a Markdown table, each row when it is known."""
+        """Print a Markdown table row by row.
+
+        Raises:
+            InputError: a number is too small, or a dataset or an effect cannot be used.
+        """
+        if self.seeds < 1 or min(self.views) < 0:
+            raise InputError("--seeds must be at least 1 and --views not negative")
         for row in self._rate_rows() if self.rate else self._rows():
             print(row, flush=True)
 
@@ -143,7 +153,7 @@ class Command:
 
 
 def _cell(found: list[Detection]) -> str:
-    """Hits of all runs, the verdicts, and the covered share."""
+    """One cell: hits of all runs, their verdicts, and the mean share of the frame that they cover."""
     hits = [one for one in found if one.verdict != "none"]
     verdicts = "/".join(sorted({one.verdict for one in hits}))
     covered = f", {verdicts}, {np.mean([one.coverage for one in hits]):.1%}" if hits else ""
@@ -151,6 +161,4 @@ def _cell(found: list[Detection]) -> str:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    tyro.cli(Command).run()
+    run_script(Command)

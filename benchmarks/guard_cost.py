@@ -1,4 +1,4 @@
-"""What the guards cost: `python benchmarks/guards.py --data DIR`
+"""Cost of the guards against values that are not finite: `python benchmarks/guard_cost.py --data DIR`
 
 One training takes every step number twice, with guards and without, in short blocks that take turns: both draw the same
 Gaussians, and a machine that drifts drifts for both. The scene grows first and keeps its Gaussians then. Nothing waits
@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
-import tyro
 from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.runs.training_run import configure, versions
 from ssa_nerfstudio.plugin.trainer import SSATrainer
@@ -140,4 +140,4 @@ class Training:
 
 
 if __name__ == "__main__":
-    tyro.cli(Command).run()
+    run_script(Command)

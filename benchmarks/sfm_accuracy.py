@@ -1,8 +1,8 @@
-"""How well does structure from motion survive a static artifact, and what helps?
+"""Accuracy of structure from motion behind a static artifact: `python benchmarks/sfm_accuracy.py --data DIR ...`
 
-`python benchmarks/sfm.py --data DIR ...` puts artifacts in front of the photos of datasets with known
-poses, runs `ssa process` on them in several ways, and prints one row a run. Camera centers are compared with
-transforms.json after a similarity alignment, relative to the mean distance of the true centers from their middle.
+Artifacts are put in front of the photos of datasets with known poses; `ssa process` runs on them in several ways.
+Camera centers are compared with transforms.json after a similarity alignment, relative to the mean distance of the true
+centers from their centroid.
 """
 
 from __future__ import annotations
@@ -12,10 +12,11 @@ import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
-from benchmarks.alignment import center_errors
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.errors import InputError
@@ -31,24 +32,25 @@ WAYS = {
     "default": (True, True, "none"),
     "default and detection": (True, True, "detected"),
 }
-"""Flattened photos, dropped stationary matches, which mask (the true one: where the transmittance is at most 0.9)."""
+"""Whether photos are flattened, whether stationary matches are dropped, and the mask: none, detected, or the true one
+(transmittance at most 0.9)."""
 
 
 def measure(
     photos: Path, mask: np.ndarray | None, detect: bool, settings: SfmSettings, true: dict[str, np.ndarray]
 ) -> dict[str, float]:
-    """Runs structure from motion and compares what it found.
+    """Run structure from motion and compare its camera centers with the true ones.
 
     Args:
-        photos: folder of them.
+        photos: folder of the photos.
         mask: bool [height, width], True where features may lie, or None.
-        detect: whether the command finds a mask by itself.
+        detect: whether to detect a mask instead.
         settings: of structure from motion.
         true: camera center [3] by the stem of the photo's file.
 
     Returns:
         photos, registered, points; and error, the root mean square of the camera centers' errors in percent of the mean
-        distance of the true centers from their middle (not a number below 4 registered photos).
+        distance of the true centers from their centroid (NaN below 4 registered photos).
     """
     source = read_source(photos, "frame", min_photos=3)
     found = {"photos": len(source.photos), "registered": 0, "points": 0, "error": float("nan")}
@@ -69,27 +71,67 @@ def measure(
     return found
 
 
+def center_errors(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Measure camera centers against true ones after the least-squares similarity between them.
+
+    Args:
+        found: [N, 3], in any frame and scale; N at least 3, not all on one line.
+        true: [N, 3].
+
+    Returns:
+        Distances [N], in units of `true`.
+    """
+    rotation, scale, translation = similarity(found, true)
+    return np.linalg.norm(scale * found @ rotation.T + translation - true, axis=1)
+
+
+def similarity(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float, np.ndarray]:
+    """Fit the similarity x -> scale R x + t between point sets by least squares.
+
+    Umeyama, Least-squares estimation of transformation parameters between two point patterns, 1991.
+
+    Args:
+        source, target: [N, 3].
+
+    Returns:
+        Rotation R [3, 3], scale, translation t [3].
+    """
+    source_offsets, target_offsets = source - source.mean(axis=0), target - target.mean(axis=0)
+    u, stretch, v = np.linalg.svd(target_offsets.T @ source_offsets)
+    # Where the best fit is a reflection, the axis of the smallest singular value is flipped.
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
+    rotation = (u * signs) @ v
+    scale = float((stretch * signs).sum() / np.square(source_offsets).sum())
+    return rotation, scale, target.mean(axis=0) - scale * rotation @ source.mean(axis=0)
+
+
 @dataclass
 class Command:
-    """Structure from motion behind artifacts, with and without what helps."""
+    """Measure structure from motion behind artifacts, with and without countermeasures."""
 
     data: tuple[Path, ...]
     """Datasets with true poses."""
     output: Path
-    """JSON lines to write, one a run; runs that it has already are not repeated."""
+    """File of JSON lines to append to, one for each run; runs that it has are not repeated."""
     effects: tuple[str, ...] = ("none", "dashboard", "ui", "mud")
-    """Artifacts; none: clean photos."""
-    ways: tuple[str, ...] = tuple(WAYS)
-    """What to do against them: COLMAP (nothing), detection, mask, default, default and detection."""
+    """Artifacts; none for clean photos."""
+    ways: tuple[Literal["COLMAP", "detection", "mask", "default", "default and detection"], ...] = tuple(WAYS)
+    """Countermeasures; COLMAP for none."""
     photos: int = 40
-    """At most so many training photos, the first in order."""
+    """Largest number of training photos, the first in order."""
     max_image_size: int = 1600
-    """Longest side that features are looked for at, pixels."""
+    """Longest side of the photos for feature extraction, pixels."""
     threads: int = 1
-    """Threads."""
+    """Threads, at least 1."""
 
     def run(self) -> None:
-        """Measure, and print the rows."""
+        """Measure, and print the rows.
+
+        Raises:
+            InputError: a number is below 1, or a dataset or an effect cannot be used.
+        """
+        if min(self.photos, self.max_image_size, self.threads) < 1:
+            raise InputError("--photos, --max-image-size and --threads must be at least 1")
         done = [json.loads(line) for line in self.output.read_text().splitlines()] if self.output.exists() else []
         for data in self.data:
             for effect in self.effects:
@@ -119,12 +161,10 @@ class Command:
 
 
 def _open_part(layers: Path) -> np.ndarray:
-    """Where the true artifact leaves more than 90 % of the scene's light."""
+    """Mask of the pixels whose transmittance is above 0.9, bool [H, W]."""
     with np.load(layers) as arrays:
         return arrays["T"].min(axis=-1) > 0.9
 
 
 if __name__ == "__main__":
-    import tyro
-
-    tyro.cli(Command).run()
+    run_script(Command)

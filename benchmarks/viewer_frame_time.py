@@ -1,7 +1,7 @@
-"""What the overlay's elements cost a frame of the viewer: `python benchmarks/viewer_frames.py --data DIR`
+"""Cost of the overlay in a frame of the viewer: `python benchmarks/viewer_frame_time.py --data DIR`
 
-One scene is drawn without artifact, with one that is off, and with one that is shown, in turns, so that a machine that
-drifts drifts for all three. Prints milliseconds and the ratios with their 95 % intervals.
+One scene is drawn without an overlay, with one that is hidden and with one that is shown, in turns, so that drift of
+the machine affects all three. Prints milliseconds and the ratios with their 95 % intervals.
 """
 
 from __future__ import annotations
@@ -17,29 +17,36 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
+from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate, versions
 
 
 @dataclass
 class Command:
-    """Measure frames of the viewer."""
+    """Time frames of the viewer without an overlay, with a hidden one and with a shown one."""
 
     data: Path
     """A nerfstudio dataset."""
     steps: int = 100
-    """Training steps before the measurement: how many Gaussians there are decides what a frame costs."""
+    """Training steps before the measurement; the number of Gaussians decides what a frame costs."""
     frames: int = 200
-    """Frames of each kind; a tenth more warm up."""
+    """Frames of each kind, at least 1; a tenth as many warm up."""
     width: int = 1024
-    """Of the viewport, pixels."""
+    """Width of the viewport, pixels."""
     height: int = 576
-    """Of the viewport, pixels."""
+    """Height of the viewport, pixels."""
 
     def run(self) -> None:
-        """Train, draw in turns, and print a line for each kind."""
+        """Train, draw in turns, and print a line for each kind.
+
+        Raises:
+            InputError: there are no frames to draw, or the dataset cannot be trained on.
+        """
+        if min(self.frames, self.width, self.height) < 1:
+            raise InputError("--frames, --width and --height must be at least 1")
         with TemporaryDirectory() as folder:
             config = configure("ssa-splatfacto", self.data, Path(folder), self.steps, {"overlay": "on"})
             _, pipeline, _ = train_and_evaluate(config)
@@ -77,7 +84,7 @@ class Command:
 
 
 def _in_a_viewer(work: Callable[[], None]) -> None:
-    """Do it in a thread of the viewer's kind, by which the model knows whom it draws for."""
+    """Work in a thread of the viewer's class, from which the model knows that it draws for the viewer."""
     failed: list[BaseException] = []
 
     class Drawing(RenderStateMachine):
@@ -110,4 +117,4 @@ def _wait() -> None:
 
 
 if __name__ == "__main__":
-    tyro.cli(Command).run()
+    run_script(Command)

@@ -1,4 +1,4 @@
-"""The documentation's pictures of the viewer, taken in a real browser: `python benchmarks/screenshots.py DIR`.
+"""The documentation's pictures of the viewer, taken in a browser: `python benchmarks/viewer_screenshots.py docs/images`
 
 Chromium is the system's own (Debian: apt install chromium) and draws WebGL in software; nothing is downloaded.
 """
@@ -17,11 +17,14 @@ import time
 import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+import tyro
 
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
@@ -31,18 +34,18 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 _FLAGS = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-_PATIENCE = 200
-"""Seconds until a server has to answer: on a loaded machine most of them go into importing."""
+_TIMEOUT = 200
+"""Seconds for a server to answer; most of them are spent on imports."""
 _STEPS = 800
 _ADAPTIVE_RATIO = re.compile(r"window\.devicePixelRatio\*\(\.2\+\.8\*[\w$]+\)")
-"""Where viser's page decides how many of the window's pixels it draws (0.2.7, which nerfstudio pins)."""
+"""Expression in viser's page for the share of the window's pixels that it draws (0.2.7, which nerfstudio pins)."""
 
 _SCENE_HAS_ITS_WIDTH = """() => {
     const before = window.widthBefore
     window.widthBefore = document.querySelector("canvas[data-engine]").clientWidth
     return window.widthBefore === before
 }"""
-"""The panel slides in, and the scene gets narrower meanwhile."""
+"""Holds once the panel has slid in, which narrows the scene."""
 
 
 def find_chromium() -> str | None:
@@ -95,7 +98,7 @@ def viewer_page(browser: Browser, *command: str | Path, width: int = 1100, heigh
             _wait_for(f"http://127.0.0.1:{port}", process)
             page = browser.new_page(viewport={"width": width, "height": height})
             _keep_resolution(page)
-            page.goto(f"http://127.0.0.1:{port}", timeout=1000 * _PATIENCE)
+            page.goto(f"http://127.0.0.1:{port}", timeout=1000 * _TIMEOUT)
             _wait_for_elements(page)
             page.get_by_role("button", name="Hide Train Cams").click()
             page.wait_for_function(_SCENE_HAS_ITS_WIDTH, polling=500)
@@ -110,24 +113,24 @@ def viewer_page(browser: Browser, *command: str | Path, width: int = 1100, heigh
 
 
 def _keep_resolution(page: Page) -> None:
-    """Have the page draw every pixel of its window, as it does on a machine whose browser has a GPU.
+    """Make the page draw every pixel of its window, as it does where the browser has a GPU.
 
-    Below 38 frames a second viser's page draws fewer pixels, step by step down to a fifth of the width, and stretches
-    them. WebGL in software is always slower: pictures would be the softer, the longer a page has been open.
+    Below 38 frames a second viser's page reduces its resolution step by step, to a fifth of the width at last. WebGL in
+    software is always slower: the longer a page were open, the softer its pictures.
     """
 
     def serve(route: Route) -> None:
         answer = route.fetch()
         script, count = _ADAPTIVE_RATIO.subn("window.devicePixelRatio", answer.text())
         if count != 1:
-            _log.warning("viser's page decides on its resolution in another way than 0.2.7 does; pictures may be soft")
+            _log.warning("viser's page sets its resolution differently from 0.2.7; pictures may be soft")
         route.fulfill(response=answer, body=script)
 
     page.route("**/assets/index-*.js", serve)
 
 
 def _wait_for(address: str, process: subprocess.Popen) -> None:
-    deadline = time.monotonic() + _PATIENCE
+    deadline = time.monotonic() + _TIMEOUT
     while True:
         if process.poll() is not None:
             raise RuntimeError("the viewer ended")
@@ -145,7 +148,7 @@ def _wait_for_elements(page: Page) -> None:
     from playwright.sync_api import TimeoutError as TooSlow
 
     last = page.get_by_role("button", name="Save artifact")
-    for _ in range(_PATIENCE // 10):
+    for _ in range(_TIMEOUT // 10):
         try:
             last.wait_for(timeout=10_000)
         except TooSlow:
@@ -153,20 +156,35 @@ def _wait_for_elements(page: Page) -> None:
         else:
             page.wait_for_timeout(1000)
             page.reload()
-            last.wait_for(timeout=1000 * _PATIENCE)
+            last.wait_for(timeout=1000 * _TIMEOUT)
             return
     raise RuntimeError("the page never had all elements")
 
 
-def main(arguments: list[str]) -> None:
-    """Train the demo's scene and take viewer-training.png, viewer-clean.png and viewer-overlay.png into one folder.
+@dataclass
+class Command:
+    """Train the built-in scene and write viewer-training.png, viewer-clean.png and viewer-overlay.png."""
+
+    output: Annotated[Path, tyro.conf.Positional]
+    """Folder for the pictures; must exist."""
+
+    def run(self) -> None:
+        """Train and take the pictures.
+
+        Raises:
+            InputError: the folder does not exist, or there is no Chromium.
+        """
+        if not self.output.is_dir():
+            raise InputError(f"{self.output} is no folder", "name one that exists")
+        take_pictures(self.output)
+
+
+def take_pictures(output: Path) -> None:
+    """Write the three pictures into a folder.
 
     Raises:
-        InputError: not exactly one folder is named, or there is no Chromium.
+        InputError: there is no Chromium.
     """
-    if len(arguments) != 1 or not Path(arguments[0]).is_dir():
-        raise InputError("name one folder for the pictures: python -m benchmarks.screenshots docs/images")
-    output = Path(arguments[0])
     scene = DemoScene()
     with tempfile.TemporaryDirectory() as scratch, browser() as running:
         data = Path(scratch) / "dashboard"
@@ -177,19 +195,19 @@ def main(arguments: list[str]) -> None:
         run = Path(scratch) / "dashboard" / "ssa-splatfacto" / "run"
         with viewer_page(running, "ns-train", "ssa-splatfacto", *options) as page:
             page.get_by_label("Show overlay").click()
-            _look_at_the_scene(page)
-            page.wait_for_function("/Step: [2-9][0-9][0-9]/.test(document.body.innerText)", timeout=1000 * _PATIENCE)
+            _orbit_to_the_boxes(page)
+            page.wait_for_function("/Step: [2-9][0-9][0-9]/.test(document.body.innerText)", timeout=1000 * _TIMEOUT)
             page.wait_for_timeout(4000)
             page.screenshot(path=output / "viewer-training.png")
-            deadline = time.monotonic() + 3 * _PATIENCE
+            deadline = time.monotonic() + 3 * _TIMEOUT
             while not (run / "nerfstudio_models").exists() or not list((run / "nerfstudio_models").glob("*599.ckpt")):
                 if time.monotonic() > deadline:
                     raise RuntimeError("the training did not end")
                 time.sleep(1)
-            time.sleep(1)  # so that the checkpoint is whole
+            time.sleep(1)  # until the checkpoint is complete
         with viewer_page(running, "ns-viewer", "--load-config", run / "config.yml") as page:
             page.get_by_label("Show overlay").scroll_into_view_if_needed()
-            _look_at_the_scene(page)
+            _orbit_to_the_boxes(page)
             page.wait_for_timeout(6000)
             page.screenshot(path=output / "viewer-clean.png")
             page.get_by_label("Show overlay").click()
@@ -198,8 +216,8 @@ def main(arguments: list[str]) -> None:
             page.screenshot(path=output / "viewer-overlay.png")
 
 
-def _look_at_the_scene(page: Page) -> None:
-    """Orbit from the viewer's first view to where the boxes are, and leave out the logo, which is on the internet."""
+def _orbit_to_the_boxes(page: Page) -> None:
+    """Orbit from the viewer's first view to the boxes, and hide the logo, which is on the internet."""
     page.add_style_tag(content="img[alt='NerfStudio Logo'] { visibility: hidden }")
     page.mouse.move(400, 350)
     page.mouse.down()
@@ -208,4 +226,4 @@ def _look_at_the_scene(page: Page) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    run_script(Command)

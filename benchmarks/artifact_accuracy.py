@@ -1,7 +1,7 @@
-"""How far a learned artifact is from the true one: `python benchmarks/artifact.py`.
+"""Error of a learned artifact against the true one: `python benchmarks/artifact_accuracy.py`
 
-Trains on the built-in scene behind a dashboard and behind a watermark, exports the artifact as a user would, and
-compares the files with what was drawn.
+The built-in scene is trained behind a dashboard and behind a watermark; the artifact is exported as a user would, and
+the files are compared with the artifact that was drawn.
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import tyro
 
+from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.export_overlay import Command as ExportOverlay
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.demo.comparison import ARTIFACTS, SMALL_SCENE
 from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
@@ -22,13 +23,19 @@ from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 @dataclass
 class Command:
-    """Errors of matte, color and picture, for each artifact of the demo."""
+    """Print the errors of matte, color and composite, for each artifact of the demo."""
 
     steps: int = 600
-    """Training steps."""
+    """Training steps, at least 1."""
 
     def run(self) -> None:
-        """Train, export, compare, print."""
+        """Train, export, compare, print.
+
+        Raises:
+            InputError: there are no steps to train.
+        """
+        if self.steps < 1:
+            raise InputError(f"--steps must be at least 1, got {self.steps}")
         scene = DemoScene()
         for name, artifact in ARTIFACTS.items():
             truth = artifact().layers(scene.height, scene.width, np.random.default_rng(0))
@@ -56,4 +63,4 @@ class Command:
 
 
 if __name__ == "__main__":
-    tyro.cli(Command).run()
+    run_script(Command)
