@@ -23,8 +23,8 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.utils import writer
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.experiments.runs.training_run import METHODS
-from ssa_nerfstudio.plugin.validation import check_transforms
 
 FIRST, LAST = 699, 1099
 """Steps between which the time is taken: after Triton's compilation and the first refinement, at step 600, which takes
@@ -48,7 +48,7 @@ class Command:
         Raises:
             InputError: the dataset cannot be trained on.
         """
-        check_transforms(self.data)
+        Transforms.read(self.data)
         config = copy.deepcopy((all_methods | METHODS)[self.method])
         config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", LAST + 1, 10 * LAST
         config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0

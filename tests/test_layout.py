@@ -7,12 +7,18 @@ from pathlib import Path
 import pytest
 
 TESTS = Path(__file__).parent
-PRODUCT = sorted(
-    path
-    for path in TESTS.rglob("*.py")
-    if path.relative_to(TESTS).parts[0] not in ("experiments", "benchmarks", "cli", "docs")
-    and path not in (TESTS / "conftest.py", Path(__file__))
-)
+OTHERS = {
+    "experiments",
+    "benchmarks",
+    "cli",
+    "docs",
+    "bare_install",
+    "conftest.py",
+    "test_layers.py",
+    Path(__file__).name,
+}
+"""What is no test of the product alone."""
+PRODUCT = sorted(path for path in TESTS.rglob("*.py") if path.relative_to(TESTS).parts[0] not in OTHERS)
 
 
 @pytest.mark.parametrize("path", PRODUCT, ids=lambda path: str(path.relative_to(TESTS)))
