@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.results import Result, write
@@ -65,9 +66,8 @@ class Request:
 
     def store(self, path: Path) -> None:
         """Write for the process to read."""
-        scratch = path.with_suffix(".part")
-        scratch.write_text(json.dumps(dataclasses.asdict(self)), encoding="utf-8")
-        scratch.replace(path)
+        with staged_file(path) as part:
+            part.write_text(json.dumps(dataclasses.asdict(self)), encoding="utf-8")
 
     @classmethod
     def load(cls, path: Path) -> Request:
