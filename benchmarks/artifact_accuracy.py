@@ -17,7 +17,8 @@ from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.export_overlay import Command as ExportOverlay
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.demo.comparison import ARTIFACTS, SMALL_SCENE
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate
+from ssa_nerfstudio.experiments.runs.run_configuration import configure
+from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 

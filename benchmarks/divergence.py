@@ -21,7 +21,8 @@ from nerfstudio.utils import writer
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import TrainingError
-from ssa_nerfstudio.experiments.runs.training_run import configure, versions
+from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 ALIVE = 0.005

@@ -18,7 +18,8 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.training_run import configure, versions
+from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY
 

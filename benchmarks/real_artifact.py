@@ -21,7 +21,8 @@ from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.training_run import configure, model_settings, train_and_evaluate
+from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
+from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 from ssa_nerfstudio.metrics.matte import matte_iou
 
 MASK = "artifact_mask_approx.png"

@@ -21,7 +21,9 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.training_run import configure, train_and_evaluate, versions
+from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.run_configuration import configure
+from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 
 
 @dataclass

@@ -38,7 +38,7 @@ def captures() -> Path:
 @pytest.fixture(scope="session")
 def configure_training() -> Callable:
     """From the experiments: `configure`, a method's configuration for an unattended run."""
-    from ssa_nerfstudio.experiments.runs.training_run import configure
+    from ssa_nerfstudio.experiments.runs.run_configuration import configure
 
     return configure
 
@@ -54,8 +54,9 @@ def train_and_evaluate() -> Callable:
 @pytest.fixture(scope="session")
 def training_imports() -> str:
     """From the experiments: what imports the two in a program that a test runs as a process of its own."""
-    module = "ssa_nerfstudio.experiments.runs.training_run"
-    return f"from {module} import configure as configure_training, train_and_evaluate\n"
+    runs = "ssa_nerfstudio.experiments.runs"
+    configure = f"from {runs}.run_configuration import configure as configure_training\n"
+    return configure + f"from {runs}.training_run import train_and_evaluate\n"
 
 
 @pytest.fixture(scope="session")

@@ -88,7 +88,7 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         for run in runs:
             print(f"{done.get(run.id, 'to do'):<9} {run.id}")
         return 0
-    with place.held():
+    with place.locked():
         for folder in command.merge:
             if not (folder / "results").is_dir():
                 raise InputError(f"--merge {folder} holds no results", "name the --output folder of another ssa bench")

@@ -15,7 +15,9 @@ from torch import Tensor
 
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.effects.watermark import Watermark
-from ssa_nerfstudio.experiments.runs.training_run import Outcome, configure, train_and_evaluate, versions
+from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.run_configuration import configure
+from ssa_nerfstudio.experiments.runs.training_run import Outcome, train_and_evaluate
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 from ssa_nerfstudio.overlay.rgba import over_checkerboard
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline

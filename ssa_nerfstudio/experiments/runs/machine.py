@@ -1,4 +1,4 @@
-"""The machine that a result comes from: versions, revision, and whether a run had the device to itself."""
+"""The machine that a result comes from: versions, revision, devices, and whether other processes used them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import psutil
 
 PACKAGES = ("torch", "gsplat", "nerfstudio", "numpy", "ssa-nerfstudio")
 """What a result depends on."""
-BUSY = 0.1
-"""Share of a machine's cores that other processes may use before a run on the CPU no longer has it to itself."""
+MAX_SHARE_OF_OTHERS = 0.1
+"""Share of the cores that other processes may use while a run on the CPU still counts as alone."""
 
 
 def versions() -> dict[str, str]:
@@ -57,14 +57,14 @@ def devices() -> list[str]:
     return [str(number) for number, line in enumerate(line for line in lines if line.startswith("GPU "))]
 
 
-class Company:
-    """Who else used the device while a run did: on CUDA other processes on it, on a CPU other processes' share."""
+class DeviceSharing:
+    """Whether other processes used the device during a run: any process on CUDA, their share of the cores on a CPU."""
 
     def __init__(self) -> None:
-        """Start watching, before this process has touched CUDA."""
+        """Start measuring; to be called before this process initializes CUDA."""
         visible = os.environ.get("CUDA_VISIBLE_DEVICES", "")
         self._device = visible.split(",")[0] if visible else ("0" if devices() else None)
-        self._others = self._processes() > 0
+        self._shared_at_start = self._processes() > 0
         self._start = time.perf_counter(), _busy(), _own()
 
     def share_of_cores(self) -> float:
@@ -75,10 +75,10 @@ class Company:
         return min(1.0, max(0.0, others / elapsed / (psutil.cpu_count() or 1)))
 
     def alone(self) -> bool:
-        """Whether, as far as can be seen from here, the device was this run's alone."""
+        """Whether no other use of the device was seen."""
         if self._device is not None:
-            return not self._others and self._processes() <= 1
-        return self.share_of_cores() <= BUSY
+            return not self._shared_at_start and self._processes() <= 1
+        return self.share_of_cores() <= MAX_SHARE_OF_OTHERS
 
     def _processes(self) -> int:
         """Processes on the CUDA device; 0 where it cannot be asked."""
@@ -92,7 +92,7 @@ class Company:
 
 
 def _busy() -> float:
-    """Seconds that all cores have worked, whoever for."""
+    """Seconds that all cores have worked, for all processes."""
     times = psutil.cpu_times()
     return sum(times) - times.idle - getattr(times, "iowait", 0.0) - getattr(times, "guest", 0.0)
 

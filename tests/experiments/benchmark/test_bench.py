@@ -20,7 +20,7 @@ from made_results import benchmark, folder_of, result
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.experiments.benchmark.execution import worker_task
 from ssa_nerfstudio.experiments.benchmark.execution.dask_runner import DaskRunner
-from ssa_nerfstudio.experiments.benchmark.execution.execute import Expectation, select
+from ssa_nerfstudio.experiments.benchmark.execution.execute import RuntimeEstimate, select
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.execution.run_process import Request
 from ssa_nerfstudio.experiments.benchmark.results import read_all
@@ -55,15 +55,15 @@ def test_scenes_and_patterns_select_runs():
 def test_a_run_takes_as_long_as_those_like_it():
     runs = plan(benchmark())
     known = [result(run) for run in runs if run.scene == "attic" and run.densification == "adc"]
-    expected = Expectation(known)
-    assert Expectation([]).seconds(runs[0]) is None
+    expected = RuntimeEstimate(known)
+    assert RuntimeEstimate([]).seconds(runs[0]) is None
     assert expected.seconds(runs[0]) == pytest.approx(8 + 700 / 100)
     longer = dataclasses.replace(runs[0], steps=7000)
     assert expected.seconds(longer) == pytest.approx(8 + 7000 / 100)
     elsewhere = next(run for run in runs if run.scene == "barn" and run.densification == "mcmc")
     assert expected.seconds(elsewhere) == pytest.approx(15)
     slow = result(elsewhere, seconds={"startup": 5, "statistics": 1, "training": 70, "evaluation": 2})
-    assert Expectation([*known, slow]).seconds(elsewhere) == pytest.approx(78)
+    assert RuntimeEstimate([*known, slow]).seconds(elsewhere) == pytest.approx(78)
 
 
 def test_no_run_is_started_that_would_not_end_in_time(tmp_path):
@@ -268,7 +268,7 @@ def test_a_run_that_fails_says_why(tmp_path, capsys):
     assert failed.status == "failed"
     assert failed.command == f"ssa bench {path} --output {tmp_path / 'out'} --only {run.id}"
     assert "the model has no setting 'sparsness'" in failed.reason
-    assert Expectation([failed]).seconds(run) is None
+    assert RuntimeEstimate([failed]).seconds(run) is None
 
 
 @pytest.mark.parametrize(

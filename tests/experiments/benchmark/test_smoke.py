@@ -118,7 +118,7 @@ def test_the_report_shows_every_method_and_names_a_file_that_is_no_result(resume
     text = (resumed / "report" / "report.md").read_text()
     assert "5 finished" in text
     assert "notes.json" in text
-    for title in ("3DGS", "SSA, default", "true overlay given", "Clean (Ref)", "Dashboard"):
+    for title in ("3DGS", "SSA, default", "oracle overlay", "Clean (Ref)", "Dashboard"):
         assert title in text
     page = (resumed / "report" / "report.html").read_text()
     assert page.count("<img") == page.count("data:image/jpeg;base64,") == 3

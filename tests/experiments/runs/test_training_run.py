@@ -11,7 +11,8 @@ import torch
 from benchmarks.guard_cost import Training
 from ssa_nerfstudio.experiments.benchmark.execution.artifact_scores import score, true_layers
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.runs.training_run import Diverged, configure, model_settings, train_and_evaluate
+from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
+from ssa_nerfstudio.experiments.runs.training_run import Diverged, train_and_evaluate
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 FULL = {"num_downscales": 0}

@@ -61,7 +61,7 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
 
     Args:
         runs: in the order of their importance.
-        place: the output folder; `held` by the caller.
+        place: the output folder; locked by the caller.
         invocation: `ssa bench NAME` or `ssa tradeoff NAME`, for the commands that results keep.
         options: how to run.
         console: progress goes there.
@@ -89,13 +89,13 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
     found = devices()
     at_once = max(1, len(found)) * options.runs_per_device
     with ProgressTable(console, len(runs), len(runs) - len(missing), at_once) as table:
-        expected = Expectation(results)
+        estimate = RuntimeEstimate(results)
 
         def ended(run: Run, result: Result | None) -> None:
             table.ended(run, result)
             trained = result if result is not None and result.status != "failed" else None
             if trained is not None:
-                expected.add(trained)
+                estimate.add(trained)
             for other in names[run.training][1:]:
                 table.ended(other, result if trained is None else adopt(trained, other, place.folder))
 
@@ -103,22 +103,22 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
             for run in same if training in known else ():
                 table.ended(run, adopt(known[training], run, place.folder))
         runner = DaskRunner(place, found, options.runs_per_device, command, options.keep_models, options.scheduler)
-        left = runner.work(todo, expected.seconds, deadline, table.watch, ended)
+        left = runner.work(todo, estimate.seconds, deadline, table.watch, ended)
     return [same for run in left for same in names[run.training]]
 
 
-class Expectation:
-    """How long a run will take, from those that have ended."""
+class RuntimeEstimate:
+    """Seconds that a run will take, estimated from finished runs."""
 
     def __init__(self, results: list[Result]) -> None:
-        """Take what ended before."""
+        """Start from the results of earlier calls."""
         self._fixed: dict[str, list[float]] = {}
         self._per_step: dict[tuple[str, str], list[float]] = {}
         for result in results:
             self.add(result)
 
     def add(self, result: Result) -> None:
-        """Take one more."""
+        """Add a result."""
         if result.status != "finished":
             return
         run, training = result.run, result.seconds["training"]

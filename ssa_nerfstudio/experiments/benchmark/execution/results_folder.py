@@ -41,7 +41,7 @@ class ResultsFolder:
 
     @property
     def unfinished(self) -> Path:
-        """What interrupted runs leave here means nothing."""
+        """Folders of the runs at work; what interrupted runs leave here is cleared."""
         return self.folder / "running"
 
     def running(self, run: str) -> Path:
@@ -57,8 +57,8 @@ class ResultsFolder:
         return self.running(run) / "progress"
 
     @contextmanager
-    def held(self) -> Iterator[None]:
-        """Keeps a second benchmark out of the folder, and clears what interrupted runs left.
+    def locked(self) -> Iterator[None]:
+        """Lock the folder against a second benchmark, and clear what interrupted runs left.
 
         Raises:
             InputError: another process holds it, or it cannot be written.

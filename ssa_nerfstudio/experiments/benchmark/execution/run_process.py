@@ -96,9 +96,9 @@ def work(request: Request, revision: str) -> Result:
         request: what to do.
         revision: of the code that does it.
     """
-    from ssa_nerfstudio.experiments.runs.machine import Company
+    from ssa_nerfstudio.experiments.runs.machine import DeviceSharing
 
-    company = Company()
+    company = DeviceSharing()
     run, place = request.run, ResultsFolder(Path(request.folder))
     note = _Progress(place.progress(run.id))
     note.stage("loading")
@@ -143,17 +143,17 @@ def work(request: Request, revision: str) -> Result:
 
 def _configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:
     """nerfstudio's configuration of a run."""
-    from ssa_nerfstudio.experiments.runs import training_run as training
+    from ssa_nerfstudio.experiments.runs import run_configuration
 
     data = place.scenes / run.dataset
     model: dict[str, Any] = {}
     if run.shipped_overlay:
-        shipped = training.METHODS["ssa-splatfacto"].pipeline.model
+        shipped = run_configuration.METHODS["ssa-splatfacto"].pipeline.model
         model = {name: value for name, value in vars(shipped).items() if name.startswith(OVERLAY_SETTINGS)}
     model |= run.model
     if model.get("overlay") == "given":
         model["overlay_given"] = data / "layers" / "undistorted.npz"
-    config = training.configure(
+    config = run_configuration.configure(
         run.nerfstudio_method,
         data,
         place.running(run.id) / "nerfstudio",

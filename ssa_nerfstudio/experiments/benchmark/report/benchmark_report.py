@@ -8,7 +8,7 @@ from collections import Counter
 from pathlib import Path
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.report import tables
+from ssa_nerfstudio.experiments.benchmark.report import category_tables, detail_tables, difference_tables
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
 from ssa_nerfstudio.experiments.benchmark.report.picture_sheets import sheet
 from ssa_nerfstudio.experiments.benchmark.report.study import CLEAN, Study, studies
@@ -102,15 +102,15 @@ def _overview(results: list[Result], planned: set[str], problems: list[str], fol
 
 def _section(study: Study, with_paper: bool) -> Section:
     drawn = [
-        tables.results_by_category(study, with_paper),
-        tables.results_by_scene(study),
-        tables.sensitivity(study, with_paper),
-        tables.ablation(study, with_paper),
-        tables.bar(study),
-        tables.paired(study, "default"),
-        tables.paired(study, "overlay-on") if "default" not in study.methods else None,
-        tables.artifact_itself(study),
-        tables.cost(study),
+        category_tables.results_by_category(study, with_paper),
+        detail_tables.results_by_scene(study),
+        category_tables.sensitivity(study, with_paper),
+        category_tables.ablation(study, with_paper),
+        difference_tables.acceptance(study),
+        difference_tables.paired(study, "default"),
+        difference_tables.paired(study, "overlay-on") if "default" not in study.methods else None,
+        detail_tables.artifact_itself(study),
+        detail_tables.cost(study),
     ]
     seeds = sorted({result.run.seed for result in study.results})
     text = [f"Schedules scaled by {study.steps} / 30000; seeds {', '.join(map(str, seeds))}."]

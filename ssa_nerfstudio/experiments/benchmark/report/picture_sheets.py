@@ -1,4 +1,4 @@
-"""Sheets of what the runs drew: for one scene and artifact a column a method, renders, artifacts and mattes below."""
+"""Sheets of the pictures of runs: for one scene and artifact a column a method, renders, artifacts and mattes below."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def sheet(columns: list[tuple[Result, Path]]) -> Image.Image | None:
     for column, (result, folder) in enumerate(columns, start=1):
         psnr = result.metrics.get("psnr")
         figure = f", {psnr:.2f} dB" if psnr is not None else ""
-        learned = "artifact given" if result.run.method == "given" else "artifact learned"
+        learned = "oracle artifact" if result.run.method == "given" else "artifact learned"
         captions = (f"{title(result.run.method)}{figure}", learned, "matte")
         for row, (name, caption) in enumerate(zip(ROWS, captions, strict=True)):
             if (folder / f"{name}.jpg").is_file():

@@ -28,7 +28,7 @@ METHODS: dict[str, Method] = {
     "default": Method("SSA, default", shipped_overlay=True),
     "overlay-on": Method("SSA, default, overlay on", {"overlay": "on"}, shipped_overlay=True),
     "paper": Method("SSA, paper's rule", _PAPER, weight_by_category=True),
-    "given": Method("true overlay given", {"overlay": "given"}),
+    "given": Method("oracle overlay", {"overlay": "given"}),
     "constant-start": Method(
         "SSA, paper's rule, constant start", {**_PAPER, "overlay_start": "constant"}, weight_by_category=True
     ),

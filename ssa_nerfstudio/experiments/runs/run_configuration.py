@@ -1,0 +1,70 @@
+"""Configurations of unattended trainings."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any, cast
+
+import yaml
+from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
+from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
+
+METHODS: dict[str, SSATrainerConfig] = {
+    str(spec.config.method_name): cast(SSATrainerConfig, spec.config)
+    for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
+}
+"""The methods by name."""
+
+
+def configure(
+    method: str,
+    data: Path,
+    output: Path,
+    steps: int,
+    model: dict[str, Any] | None = None,
+    scale_factor: float = 1.0,
+    seed: int = 0,
+) -> SSATrainerConfig:
+    """A method's configuration for an unattended run: no viewer, no evaluation in between, one checkpoint at the end.
+
+    Args:
+        method: a key of `METHODS`.
+        data: nerfstudio dataset; without named splits every 8th photo is held out.
+        output: folder of the run (nerfstudio puts `<name>/<method>/<time>` below it).
+        steps: number of training steps; schedules are scaled to it.
+        model: values of the model's configuration by field name.
+        scale_factor: photos are resized by this.
+        seed: added to nerfstudio's own, of all random numbers and of the order of the views.
+    """
+    config = copy.deepcopy(METHODS[method])
+    config.vis = "tensorboard"
+    config.logging.local_writer.enable = False
+    config.data, config.output_dir, config.max_num_iterations = data, output, steps
+    config.steps_per_save = steps + 1
+    config.steps_per_eval_image = 0
+    config.machine.seed += seed
+    datamanager = config.pipeline.datamanager
+    datamanager.data, datamanager.camera_res_scale_factor = data, scale_factor
+    datamanager.train_cameras_sampling_seed += seed
+    datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
+    for name, value in (model or {}).items():
+        if not hasattr(config.pipeline.model, name):
+            raise AttributeError(f"the model has no setting {name!r}")
+        setattr(config.pipeline.model, name, value)
+    return config
+
+
+def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
+    """Settings of the model by field name, from name=value."""
+    usual, model = SSASplatfactoModelConfig(), {}
+    for name, value in (setting.split("=", 1) for setting in settings):
+        model[name] = yaml.safe_load(value)
+        if isinstance(model[name], bool) and isinstance(getattr(usual, name, None), str):
+            model[name] = value.lower()  # YAML reads on and off as booleans
+    if "overlay_given" in model:
+        model["overlay_given"] = Path(model["overlay_given"])
+    return model
