@@ -51,6 +51,7 @@ class SSATrainer(Trainer):
     config: SSATrainerConfig
     pipeline: SSAPipeline
     optimizers: JointOptimizers
+    _one: torch.Tensor | None = None
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         check_device(config.machine.device_type)
@@ -178,7 +179,9 @@ class SSATrainer(Trainer):
         with torch.autocast(device_type="cuda" if "cuda" in self.device else "cpu", enabled=self.mixed_precision):
             _, losses, metrics = self.pipeline.get_train_loss_dict(step=step)
             loss = reduce(torch.add, losses.values())
-        self.grad_scaler.scale(loss).backward()
+        if self._one is None:
+            self._one = torch.ones_like(loss, requires_grad=False)
+        self.grad_scaler.scale(loss).backward(self._one)  # without one, autograd fills one in at every step
         loss = loss.detach()
         due = [name for name in optimizers.parameters if step % every[name] == every[name] - 1]
         optimizers.step_groups(due, loss, self.grad_scaler)

@@ -91,7 +91,7 @@ class NonFiniteGuard:
             info: the rasterizer's. No Gaussian of a skipped step has a radius, and MCMC's noise has no amplitude.
         """
         taken = self._verdicts[self._judged - 1].taken
-        info["radii"] = info["radii"] * taken.to(info["radii"].dtype)
+        info["radii"] = info["radii"] * taken  # as float32: a cast would be one more launch
         info["noise_scale"] = taken
 
     def check(self, step: int) -> int:
