@@ -1,4 +1,4 @@
-"""The effects by name; a module is imported when its effect is asked for and not before."""
+"""The effects by name; the module of an effect is imported with its first use."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ EFFECTS = {
     "vignette": "Vignette",
     "dust": "Dust",
 }
-"""Name of each effect, which is also its module's, and its class."""
+"""Class of each effect by its name, which is also its module's."""
 
 
 class Effect(Protocol):
     """A frozen dataclass of parameters that draws an artifact for any frame."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers | VaryingLayers:
-        """The artifact at one frame size, pixels; `rng` decides all that chance decides."""
+        """Draw the artifact at one frame size, pixels; `rng` decides everything random."""
         ...
 
 
 def effect_class(name: str) -> type[Effect]:
-    """The class of an effect.
+    """Return the class of an effect.
 
     Raises:
         KeyError: there is no such effect.

@@ -11,14 +11,14 @@ from ssa_nerfstudio.experiments.effects.layers import Box, Layers, VaryingLayers
 
 
 class Composition:
-    """Effects of one frame, the first nearest to the scene and the last nearest to the eye.
+    """Effects of one frame, the first nearest to the scene and the last nearest to the camera.
 
-    What is the same in every view is composed once; only the rectangle around the effects that vary is composed again
-    for a view.
+    Layers that all views share are composed once; only the rectangle around the effects that vary is composed for each
+    view.
     """
 
     def __init__(self, parts: Sequence[Layers | VaryingLayers]) -> None:
-        """Take the effects' layers, all of one frame size.
+        """Store the effects' layers, all of one frame size.
 
         Args:
             parts: at least one.
@@ -32,7 +32,7 @@ class Composition:
         """The layers outside `box`; None where nothing covers it."""
 
     def view(self, generators: Sequence[np.random.Generator]) -> Layers:
-        """One view's layers inside `box`, rounded to float16 so that they can be stored as such, exactly.
+        """Draw one view's layers inside `box`, rounded to float16 so that they can be stored as such, exactly.
 
         Args:
             generators: one for each effect that varies, in their order.
@@ -54,11 +54,11 @@ class Composition:
         return Layers(*(values.astype(np.float16).astype(np.float32) for values in pair))
 
     def apply(self, image: np.ndarray, inside: Layers | None) -> np.ndarray:
-        """The image with the artifact in front of it.
+        """Put the artifact in front of an image.
 
         Args:
             image: clean photo, uint8 [H, W, 3].
-            inside: what `view` gave, where effects vary; else None.
+            inside: result of `view` where effects vary, else None.
 
         Returns:
             uint8 [H, W, 3].
@@ -69,7 +69,7 @@ class Composition:
         return formed
 
     def whole(self, inside: Layers | None, height: int, width: int) -> Layers:
-        """The layers of the whole frame: `static` with `inside` in its place."""
+        """Return the layers of the whole frame: `static`, with `inside` in its box."""
         base = self.static
         if base is None:
             base = Layers(np.ones((height, width, 3), np.float32), np.zeros((height, width, 3), np.float32))
@@ -88,7 +88,7 @@ def _bounding_box(boxes: list[Box]) -> Box:
 
 
 def _pasted(layers: Layers, box: Box, frame: Box) -> Layers:
-    """Layers of `box` on clear ground of a rectangle `frame` around it."""
+    """Layers of `box` in a rectangle `frame` around it that is clear elsewhere."""
     if box == frame:
         return layers
     shape = (frame[0].stop - frame[0].start, frame[1].stop - frame[1].start, 3)

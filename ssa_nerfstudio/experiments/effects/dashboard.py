@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
+from ssa_nerfstudio.experiments.effects.parameters import STRICT, Color
+from ssa_nerfstudio.experiments.effects.shapes import coverage
 
-Color = tuple[int, int, int]
 
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class Dashboard:
     """A dashcam's view of the car: padded panel, instrument cluster with two gauges, steering wheel, screen.
 
@@ -22,9 +23,9 @@ class Dashboard:
         ValueError: a field is out of its range.
     """
 
-    height: float = 0.32
+    height: Annotated[float, Field(gt=0, le=0.5)] = 0.32
     """Fraction of the frame's height covered at the highest point, in (0, 0.5]."""
-    softness: float = 1.5
+    softness: Annotated[float, Field(ge=0.5, le=50)] = 1.5
     """Width of the ramp from opaque to absent along the edge, pixels, in [0.5, 50]."""
     panel_color: Color = (64, 60, 58)
     """Padded panel, sRGB, 0..255."""
@@ -39,12 +40,8 @@ class Dashboard:
     screen_color: Color = (46, 92, 128)
     """Screen in the middle of the car, sRGB, 0..255."""
 
-    def __post_init__(self) -> None:
-        require(self, height="(0, 0.5]", softness="[0.5, 50]")
-        require_colors(self, *(f"{part}_color" for part in ("panel", "cluster", "dial", "needle", "wheel", "screen")))
-
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """The dashboard at one frame size.
+        """Draw the dashboard at one frame size.
 
         Args:
             height: frame height, pixels, at least 1.
@@ -120,9 +117,9 @@ class _Painter:
         self.color = np.clip(self.color * factor[..., None], 0, 1)
 
     def paint(self, color: Color, distance: np.ndarray, opacity: float = 1.0) -> None:
-        """Composites a color where `distance` [height, width], in units, is negative."""
-        coverage = opacity * np.clip(0.5 - distance * self.unit, 0, 1)[..., None]
-        self.color += coverage * (np.array(color) / 255 - self.color)
+        """Composite a color where `distance` [height, width], in units, is negative."""
+        alpha = opacity * coverage(distance * self.unit)[..., None]
+        self.color += alpha * (np.array(color) / 255 - self.color)
 
 
 def _rounded_box(x: np.ndarray, y: np.ndarray, half_width: float, half_height: float, radius: float) -> np.ndarray:

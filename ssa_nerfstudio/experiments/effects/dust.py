@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require
+from ssa_nerfstudio.experiments.effects.parameters import STRICT, Share
+from ssa_nerfstudio.experiments.effects.shapes import coverage, edge_width
 
 _SUBPIXEL_BITS = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class Dust:
     """Specks and fibres scattered over the frame, each dimming what is behind it.
 
@@ -23,22 +26,19 @@ class Dust:
         ValueError: a field is out of its range.
     """
 
-    specks: int = 60
+    specks: Annotated[int, Field(ge=0, le=10_000)] = 60
     """Number of specks, in [0, 10000]."""
-    fibres: int = 6
+    fibres: Annotated[int, Field(ge=0, le=1_000)] = 6
     """Number of fibres, in [0, 1000]."""
-    radius: float = 0.012
+    radius: Annotated[float, Field(gt=0, le=0.2)] = 0.012
     """Radius of the largest specks as a fraction of the frame's diagonal, in (0, 0.2]; the smallest have a fifth."""
-    opacity: float = 0.75
+    opacity: Share = 0.75
     """Share of the light that the densest particle takes, in (0, 1]; the thinnest takes 0.4 of that."""
-    softness: float = 0.6
+    softness: Share = 0.6
     """Width of a speck's edge as a fraction of its radius, in (0, 1]."""
 
-    def __post_init__(self) -> None:
-        require(self, specks="[0, 10000]", fibres="[0, 1000]", radius="(0, 0.2]", opacity="(0, 1]", softness="(0, 1]")
-
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """The dust at one frame size.
+        """Draw the dust at one frame size.
 
         Args:
             height: frame height, pixels, at least 1.
@@ -57,7 +57,7 @@ class Dust:
         return self.opacity * rng.uniform(0.4, 1)
 
     def _add_speck(self, transmittance: np.ndarray, radius: float, rng: np.random.Generator) -> None:
-        """Multiplies one speck into T [H, W]."""
+        """Multiply one speck into T [H, W]."""
         height, width = transmittance.shape
         center_x, center_y, density = rng.uniform(0, width), rng.uniform(0, height), self._density(rng)
         squeeze, turn = rng.uniform(0.7, 1), rng.uniform(0, np.pi)
@@ -68,11 +68,11 @@ class Dust:
         x = np.arange(columns.start, columns.stop)[None, :] + 0.5 - center_x
         along, across = x * np.cos(turn) + y * np.sin(turn), y * np.cos(turn) - x * np.sin(turn)
         distance = np.hypot(along, across / squeeze) - radius
-        edge = max(1.0, self.softness * radius)
-        transmittance[rows, columns] *= 1 - density * np.clip(0.5 - distance / edge, 0, 1)
+        edge = edge_width(self.softness, radius)
+        transmittance[rows, columns] *= 1 - density * coverage(distance / edge)
 
     def _fibre(self, height: int, width: int, largest: float, rng: np.random.Generator) -> np.ndarray:
-        """What one fibre takes from every pixel, [H, W] in [0, 1]: a blurred curve."""
+        """Share of the light that one fibre takes, [H, W] in [0, 1]: a blurred curve."""
         start, length = rng.uniform(0, [width, height]), largest * rng.uniform(6, 14)
         heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0.06, 0.1, 24))
         steps = length / 24 * np.stack([np.cos(heading), np.sin(heading)], axis=1)

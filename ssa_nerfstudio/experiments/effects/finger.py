@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from ssa_nerfstudio.experiments.effects.layers import Layers, VaryingLayers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
+from ssa_nerfstudio.experiments.effects.parameters import STRICT, Color, Share, Unit
+from ssa_nerfstudio.experiments.effects.shapes import clipped_normal, coverage, edge_width, pixel_centers
 
 _OUTWARD = {"left": (-1, 0), "right": (1, 0), "top": (0, -1), "bottom": (0, 1)}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class Finger:
     """A stand-in for the paper's real "Finger" captures: a finger anchored to the frame's edge.
 
@@ -26,37 +28,23 @@ class Finger:
 
     side: Literal["left", "right", "top", "bottom"] = "right"
     """Edge of the frame that the finger comes from."""
-    position: float = 0.7
+    position: Unit = 0.7
     """Where along that edge, from left or top, in [0, 1]."""
-    reach: float = 0.42
+    reach: Share = 0.42
     """How far the tip reaches into the frame, as a fraction of its shorter side, in (0, 1]."""
-    thickness: float = 0.4
+    thickness: Share = 0.4
     """Width of the finger as a fraction of the frame's shorter side, in (0, 1]."""
-    blur: float = 0.13
+    blur: Annotated[float, Field(gt=0, le=0.5)] = 0.13
     """Width of the defocused edge as a fraction of the frame's shorter side, in (0, 0.5]."""
-    opacity: float = 0.98
+    opacity: Share = 0.98
     """Opacity inside the edge, in (0, 1]."""
-    color: tuple[int, int, int] = (182, 124, 102)
+    color: Color = (182, 124, 102)
     """Skin in the mean light, sRGB, 0..255."""
-    variation: float = 0.08
+    variation: Annotated[float, Field(ge=0, le=0.5)] = 0.08
     """Standard deviation, from view to view, of the light's brightness relative to its mean, in [0, 0.5]."""
 
-    def __post_init__(self) -> None:
-        if self.side not in _OUTWARD:
-            raise ValueError(f"Finger.side must be one of {', '.join(_OUTWARD)}, got {self.side!r}")
-        require(
-            self,
-            position="[0, 1]",
-            reach="(0, 1]",
-            thickness="(0, 1]",
-            blur="(0, 0.5]",
-            opacity="(0, 1]",
-            variation="[0, 0.5]",
-        )
-        require_colors(self, "color")
-
     def layers(self, height: int, width: int, rng: np.random.Generator) -> VaryingLayers:
-        """The finger at one frame size.
+        """Draw the finger at one frame size.
 
         Args:
             height: frame height, pixels, at least 1.
@@ -69,13 +57,13 @@ class Finger:
         axis = np.array([[np.cos(tilt), -np.sin(tilt)], [np.sin(tilt), np.cos(tilt)]]) @ outward
         radius = self.thickness * short / 2
 
-        x, y = np.arange(width)[None, :] + 0.5, np.arange(height)[:, None] + 0.5
+        x, y = pixel_centers(height, width)
         tip = middle - (self.reach * short - radius) * axis
         along = (x - tip[0]) * axis[0] + (y - tip[1]) * axis[1]
         across = (y - tip[1]) * axis[0] - (x - tip[0]) * axis[1]
-        # A finger widens a little towards the hand.
+        # A finger widens a little toward the hand.
         distance = np.hypot(np.minimum(along, 0), across) - radius - 0.12 * np.maximum(along, 0)
-        ramp = np.clip(0.5 - distance / max(1.0, self.blur * short), 0, 1)
+        ramp = coverage(distance / edge_width(self.blur, short))
         matte = self.opacity * ramp**2 * (3 - 2 * ramp)
 
         rows, columns = np.flatnonzero(matte.any(axis=1)), np.flatnonzero(matte.any(axis=0))
@@ -90,9 +78,7 @@ class Finger:
         across, along = across.astype(np.float32), np.clip(along, -1, 2).astype(np.float32)
 
         def view(rng: np.random.Generator) -> Layers:
-            gain, slope_across, slope_along, *tint = (
-                self.variation * np.clip(rng.standard_normal(6), -2.5, 2.5)
-            ).tolist()
+            gain, slope_across, slope_along, *tint = (self.variation * clipped_normal(rng, 6, 2.5)).tolist()
             light = body + slope_across * across + 0.5 * slope_along * along
             color = light[..., None] * skin * ((1 + gain) * (1 + 0.3 * np.array(tint, np.float32)))
             return Layers.composited(matte, np.clip(color, 0, 1))

@@ -1,4 +1,4 @@
-"""What every effect amounts to: how much light it lets through and how much it adds."""
+"""The image formation of every effect: how much light it lets through and how much it adds."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Layers:
 
     @classmethod
     def composited(cls, matte: np.ndarray, color: np.ndarray) -> Layers:
-        """The paper's compositing: T = 1 - A and B = A W.
+        """Composite as the paper does: T = 1 - A and B = A W.
 
         Args:
             matte: A, [H, W] in [0, 1].
@@ -50,7 +50,7 @@ class Layers:
 
     @classmethod
     def dimming(cls, transmittance: np.ndarray) -> Layers:
-        """A multiplicative artifact: T [H, W] in [0, 1] for all channels, B = 0."""
+        """Make a multiplicative artifact: T [H, W] in [0, 1] for all channels, B = 0."""
         values = np.repeat(transmittance.astype(np.float32)[..., None], 3, axis=2)
         return cls(values, np.zeros_like(values))
 
@@ -68,7 +68,7 @@ class Layers:
         return Layers(self.transmittance[box], self.addition[box])
 
     def apply(self, image: np.ndarray) -> np.ndarray:
-        """The image with the artifact in front of it.
+        """Put the artifact in front of an image.
 
         Args:
             image: clean photo, uint8 [H, W, 3]; C = image / 255.
@@ -94,4 +94,4 @@ class VaryingLayers:
     box: Box
     """Where T can differ from 1 or B from 0, in any view."""
     view: Callable[[np.random.Generator], Layers]
-    """One view's layers inside the box; the generator decides what this view has of its own."""
+    """Draws one view's layers inside the box; the generator decides how this view differs."""

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from ssa_nerfstudio.experiments.effects.layers import Layers, VaryingLayers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
+from ssa_nerfstudio.experiments.effects.parameters import STRICT, Color, Unit
+from ssa_nerfstudio.experiments.effects.shapes import clipped_normal, coverage, edge_width, pixel_centers
 
-_LARGEST_SWAY = 3
-"""Drift is drawn from a normal distribution cut off at so many standard deviations."""
+_MAX_SWAY = 3
+"""Largest sway, standard deviations."""
 _JOINT_RADIUS = 1.7
 """Radius of the ball joint at the arm's end, in halves of the arm's thickness."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class Occlusion:
     """A stand-in for the paper's real "Occlusion" captures: a mounting arm with a clamp, reaching in from a corner.
 
@@ -29,35 +31,21 @@ class Occlusion:
 
     corner: Literal["bottom-left", "bottom-right", "top-left", "top-right"] = "bottom-left"
     """Corner of the frame that the arm comes from."""
-    reach: float = 0.62
+    reach: Annotated[float, Field(gt=0, le=1.5)] = 0.62
     """Length of the arm in the frame as a fraction of the frame's shorter side, in (0, 1.5]."""
-    thickness: float = 0.11
+    thickness: Annotated[float, Field(gt=0, le=0.5)] = 0.11
     """Thickness of the arm as a fraction of the frame's shorter side, in (0, 0.5]."""
-    blur: float = 0.012
+    blur: Annotated[float, Field(gt=0, le=0.5)] = 0.012
     """Width of the defocused edge as a fraction of the frame's shorter side, in (0, 0.5]."""
-    color: tuple[int, int, int] = (42, 44, 48)
+    color: Color = (42, 44, 48)
     """The arm where it reflects nothing, sRGB, 0..255."""
-    drift: float = 2.0
+    drift: Annotated[float, Field(ge=0, le=50)] = 2.0
     """Standard deviation of the sway along each axis, from view to view, raw pixels, in [0, 50]."""
-    reflection: float = 0.35
+    reflection: Unit = 0.35
     """Brightness of the strongest highlight, in [0, 1]; each view has between 0.3 and 1 of it."""
 
-    def __post_init__(self) -> None:
-        corners = ("bottom-left", "bottom-right", "top-left", "top-right")
-        if self.corner not in corners:
-            raise ValueError(f"Occlusion.corner must be one of {', '.join(corners)}, got {self.corner!r}")
-        require(
-            self,
-            reach="(0, 1.5]",
-            thickness="(0, 0.5]",
-            blur="(0, 0.5]",
-            drift="[0, 50]",
-            reflection="[0, 1]",
-        )
-        require_colors(self, "color")
-
     def layers(self, height: int, width: int, rng: np.random.Generator) -> VaryingLayers:
-        """The arm at one frame size.
+        """Draw the arm at one frame size.
 
         Args:
             height: frame height, pixels, at least 1.
@@ -66,7 +54,7 @@ class Occlusion:
         """
         short, down, right = min(height, width), self.corner.startswith("bottom"), self.corner.endswith("right")
         angle, half = rng.uniform(0.6, 0.95), self.thickness * short / 2
-        edge, sway = max(1.0, self.blur * short), _LARGEST_SWAY * self.drift
+        edge, sway = edge_width(self.blur, short), _MAX_SWAY * self.drift
         extent = np.array([np.cos(angle), np.sin(angle)]) * self.reach * short + 3 * half + edge + sway
         columns, rows = np.minimum(np.ceil(extent).astype(int), [width, height])
         box = (
@@ -74,17 +62,17 @@ class Occlusion:
             slice(width - columns, width) if right else slice(0, columns),
         )
         # From the corner inwards, pixels.
-        x, y = np.arange(columns, dtype=np.float32)[None, :] + 0.5, np.arange(rows, dtype=np.float32)[:, None] + 0.5
+        x, y = (axis.astype(np.float32) for axis in pixel_centers(rows, columns))
         x, y = x[:, ::-1] if right else x, y[::-1] if down else y
         end, cos, sin = self.reach * short / half, float(np.cos(angle)) / half, float(np.sin(angle)) / half
 
         def view(rng: np.random.Generator) -> Layers:
-            sway_x, sway_y = self.drift * np.clip(rng.standard_normal(2), -_LARGEST_SWAY, _LARGEST_SWAY)
+            sway_x, sway_y = self.drift * clipped_normal(rng, 2, _MAX_SWAY)
             inward, upward = x - float(sway_x), y - float(sway_y)
             # Along the arm and across it, in halves of its thickness; the joint is the origin.
             u, v = inward * cos + upward * sin - end, upward * cos - inward * sin
             distance = np.minimum(np.maximum(np.abs(v) - 1, u), np.hypot(u, v) - _JOINT_RADIUS)
-            matte = np.clip(0.5 - distance * (half / edge), 0, 1)
+            matte = coverage(distance * (half / edge))
             covered = matte > 0
             color = np.zeros((*matte.shape, 3), np.float32)
             color[covered] = self._shade(u[covered], v[covered], rng)

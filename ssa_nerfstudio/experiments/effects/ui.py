@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
+from ssa_nerfstudio.experiments.effects.parameters import STRICT, Color, Share
 
 _FINE = 4
 """Oversampling in frames of up to a megapixel, half of it in larger ones."""
-Color = tuple[int, int, int]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class UI:
     """The paper's "UI Elements": buttons and HUD elements on the periphery, the middle of the frame left free.
 
@@ -27,9 +28,9 @@ class UI:
         ValueError: a field is out of its range.
     """
 
-    scale: float = 1.0
+    scale: Annotated[float, Field(ge=0.2, le=1)] = 1.0
     """Size of all elements, in [0.2, 1]; at 1 a button's side is 0.1 of the frame's height or 1 / 13 of its width."""
-    panel_alpha: float = 0.65
+    panel_alpha: Share = 0.65
     """Opacity of panels and empty buttons, in (0, 1]."""
     panel_color: Color = (18, 22, 30)
     """Panels, sRGB, 0..255."""
@@ -40,12 +41,8 @@ class UI:
     title: str = "LEVEL 07"
     """The line at the upper edge; may be empty."""
 
-    def __post_init__(self) -> None:
-        require(self, scale="[0.2, 1]", panel_alpha="(0, 1]")
-        require_colors(self, "panel_color", "accent_color", "text_color")
-
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """The interface at one frame size.
+        """Draw the interface at one frame size.
 
         Args:
             height: frame height, pixels, at least 1.

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.effects.ranges import require, require_colors
+from ssa_nerfstudio.experiments.effects.parameters import STRICT, Color, Share
 
 _OVERSAMPLING = 4
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=STRICT)
 class Watermark:
     """Stock footage's watermark, composited at one opacity over every frame (paper, synthetic artifacts).
 
@@ -21,28 +23,22 @@ class Watermark:
         ValueError: a field is out of its range.
     """
 
-    alpha: float = 0.4
+    alpha: Share = 0.4
     """Opacity of the mark, in (0, 1]; the paper uses 0.4."""
-    size: float = 0.62
+    size: Share = 0.62
     """Width of the text line as a fraction of the frame's width, in (0, 1]; smaller where a flat frame needs it."""
-    color: tuple[int, int, int] = (255, 255, 255)
+    color: Color = (255, 255, 255)
     """Color of the mark, sRGB, 0..255."""
-    text: str = "SAMPLE STOCK"
+    text: Annotated[str, Field(pattern=r"\S")] = "SAMPLE STOCK"
     """The line beneath the logo; not empty."""
 
-    def __post_init__(self) -> None:
-        require(self, alpha="(0, 1]", size="(0, 1]")
-        require_colors(self, "color")
-        if not self.text.strip():
-            raise ValueError(f"Watermark.text must not be empty, got {self.text!r}")
-
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """The watermark at one frame size.
+        """Draw the watermark at one frame size.
 
         Args:
             height: frame height, pixels, at least 1.
             width: frame width, pixels, at least 1.
-            rng: not drawn from; a watermark has no chance in it.
+            rng: not used; a watermark is not random.
 
         Returns:
             T = 1 - A and B = A color, with A = alpha times the mark's coverage of the pixel.

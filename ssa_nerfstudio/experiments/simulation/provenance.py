@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import importlib.metadata
 import platform
+from contextlib import suppress
 from typing import Any
 
 import cv2
@@ -57,7 +58,8 @@ def scene_record(dataset: Dataset, scene: Scene) -> str:
         "Pillow": PIL.__version__,
     }
     if any(name in ("rain", "mud") for name, _ in scene.effects):
-        versions["albumentations"] = importlib.metadata.version("albumentations")
+        with suppress(importlib.metadata.PackageNotFoundError):
+            versions["albumentations"] = importlib.metadata.version("albumentations")
     record = {
         "effects": scene.describe(),
         "seed": scene.seed,

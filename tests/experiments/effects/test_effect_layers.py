@@ -159,5 +159,5 @@ def test_watermark_color() -> None:
     ],
 )
 def test_bad_fields_are_named(effect: type[Dashboard] | type[Watermark], field: str, value: object) -> None:
-    with pytest.raises(ValueError, match=rf"{effect.__name__}\.{field} must .*got "):
+    with pytest.raises(ValueError, match=rf"for {effect.__name__}\n{field}(\.\d)?\n"):
         dataclasses.replace(effect(), **{field: value})

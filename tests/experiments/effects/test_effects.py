@@ -12,6 +12,7 @@ from albumentations import Spatter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS, effect_class
 from ssa_nerfstudio.experiments.effects.composition import Composition
 from ssa_nerfstudio.experiments.effects.dust import Dust
@@ -220,8 +221,15 @@ def test_what_varies_stays_in_its_box():
     ],
 )
 def test_bad_fields_are_named(effect, field, value):
-    with pytest.raises(ValueError, match=rf"{effect.__name__}\.{field} must .*got "):
+    with pytest.raises(ValueError, match=rf"for {effect.__name__}\n{field}(\.\d)?\n"):
         dataclasses.replace(effect(), **{field: value})
+
+
+@pytest.mark.parametrize("effect", [Rain(), Mud()])
+def test_without_albumentations_the_extra_is_named(effect, monkeypatch):
+    monkeypatch.setitem(sys.modules, "albumentations", None)
+    with pytest.raises(InputError, match=r"needs the package albumentations; pip install 'ssa-nerfstudio\[exp"):
+        effect.layers(8, 8, rng())
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
