@@ -59,3 +59,8 @@ def test_the_product_is_most_of_the_package_and_no_module_is_large():
     experiments = sum(count for path, count in lines.items() if "experiments" in path.parts)
     assert 1 - experiments / sum(lines.values()) > PRODUCT_SHARE
     assert [path for path, count in lines.items() if count >= MAX_LINES] == []
+
+
+def test_no_two_modules_share_a_name():
+    names = [path.stem for path in (ROOT / "ssa_nerfstudio").rglob("*.py") if path.stem not in ("__init__", "__main__")]
+    assert sorted(names) == sorted(set(names))

@@ -39,7 +39,7 @@ class Command(BenchCommand):
 
         chosen = {run.id for run in select(planned, self.scenes, self.only)}
         console = Console(highlight=False, soft_wrap=True)
-        from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyze
+        from ssa_nerfstudio.experiments.benchmark.report.tradeoff_report import analyze
 
         files, problems = analyze([self.output, *self.merge], self.output / "tradeoff", chosen)
         for problem in problems:

@@ -19,10 +19,10 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.training.checkpoints import (
-    atomic_checkpoints,
     damage,
     load_pipeline_state,
     newest_first,
+    staged_checkpoints,
     step_of,
 )
 from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
@@ -153,7 +153,7 @@ class SSATrainer(Trainer):
             )
         folder = self.checkpoint_dir
         try:
-            with atomic_checkpoints(folder) as self.checkpoint_dir:
+            with staged_checkpoints(folder) as self.checkpoint_dir:
                 super().save_checkpoint(step)
         except (OSError, RuntimeError) as error:
             earlier = newest_first(folder)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import zipfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
 
 import torch
+
+from ssa_nerfstudio.data.writing import staged_files
 
 PARTIAL = "checkpoint.partial"
 """Folder of a run in which a checkpoint is written; a killed run leaves it behind, and it is never read. It is not in
@@ -38,25 +37,9 @@ def damage(checkpoint: Path) -> str | None:
     return None if wrong is None else f"the checksum of {wrong} in it is wrong"
 
 
-@contextmanager
-def atomic_checkpoints(folder: Path) -> Iterator[Path]:
-    """Yield a folder to write into, whose files are moved into `folder` when the block ends.
-
-    After an error they are removed and `folder` is unchanged.
-    """
-    partial = folder.parent / PARTIAL
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        for path in partial.iterdir():
-            # Data before name: after a power failure the name must not be there alone.
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-            folder.mkdir(parents=True, exist_ok=True)
-            path.replace(folder / path.name)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+def staged_checkpoints(folder: Path) -> AbstractContextManager[Path]:
+    """A folder to write into, whose files are moved into `folder` when the block ends (`data.writing.staged_files`)."""
+    return staged_files(folder, folder.parent / PARTIAL)
 
 
 def load_pipeline_state(checkpoint: Path) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ from made_results import benchmark, folder_of, result
 from PIL import Image
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.report.tradeoff import analyze
+from ssa_nerfstudio.experiments.benchmark.report.tradeoff_report import analyze
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Tradeoff
 from ssa_nerfstudio.experiments.benchmark.specification.plan import plan_tradeoff

@@ -14,7 +14,7 @@ import yaml
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
-from ssa_nerfstudio.plugin.training.checkpoints import PARTIAL, atomic_checkpoints, newest_first
+from ssa_nerfstudio.plugin.training.checkpoints import PARTIAL, newest_first, staged_checkpoints
 
 AS_NS_TRAIN = "import sys; sys.argv[0] = 'ns-train'\n"
 """Exceptions end the process as they end nerfstudio's command."""
@@ -173,11 +173,11 @@ def test_only_the_latest_is_kept_and_only_once_it_is_there(tiny_scene, tmp_path,
 
 def test_an_error_while_writing_leaves_the_folder_as_it_was(tmp_path):
     folder = tmp_path / "run" / "nerfstudio_models"
-    with atomic_checkpoints(folder) as partial:
+    with staged_checkpoints(folder) as partial:
         (partial / "step-000000001.ckpt").write_text("old")
 
     def fail() -> None:
-        with atomic_checkpoints(folder) as partial:
+        with staged_checkpoints(folder) as partial:
             (partial / "step-000000002.ckpt").write_text("half")
             raise OSError("full")
 
