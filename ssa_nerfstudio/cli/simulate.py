@@ -1,4 +1,4 @@
-"""`ssa simulate`: the arguments and what they are handed to."""
+"""`ssa simulate`."""
 
 from __future__ import annotations
 
@@ -20,23 +20,23 @@ class Command:
     """Dataset to write; must not exist."""
     effects: tuple[str, ...] | None = None
     """From the scene outwards: watermark, ui, dashboard, rain, mud, finger, occlusion, vignette, dust, their variants
-    by name, or .yaml files. `--effects` with nothing behind it copies the dataset and adds the split."""
+    by name, or .yaml files. `--effects` without a value copies the dataset and adds the split."""
     scene: str | None = None
     """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats its effects."""
     seed: int | None = None
-    """Decides all that chance decides, not negative; the scene's own, or 0, where not given."""
+    """Decides everything random, not negative; by default the scene's own, or 0."""
     eval_interval: int = 8
-    """Every so many photos, in sorted order, one is for testing; ignored where transforms.json has a split."""
+    """One photo in so many, in sorted order, is for testing; ignored where transforms.json has a split."""
     downscale_factor: int = 1
     """Read the photos from images_N and write a dataset of that size."""
     threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    """Photos worked on at once."""
+    """Photos in flight at once."""
 
     def run(self) -> None:
-        """Simulate, and say what to do next.
+        """Simulate, and print the next step.
 
         Raises:
-            InputError: the arguments, the dataset or a configuration cannot be worked with.
+            InputError: the arguments, the dataset or a configuration cannot be used.
         """
         from rich.console import Console
 

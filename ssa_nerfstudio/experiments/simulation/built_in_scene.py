@@ -1,16 +1,18 @@
-"""A synthetic capture whose every pixel is known: a textured room with boxes, ray-cast from an arc of cameras."""
+"""A synthetic capture with known poses and clean photos: a textured room with boxes, seen from an arc of cameras."""
 
 from __future__ import annotations
 
 import json
-import tempfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from PIL import Image
+
+from ssa_nerfstudio.data.writing import staged_folder
+from ssa_nerfstudio.experiments.simulation.ray_casting import Cuboid, make_cuboid, trace
 
 if TYPE_CHECKING:
     from ssa_nerfstudio.experiments.effects.layers import Layers
@@ -27,38 +29,16 @@ _CUBOIDS = (
 )
 """Center and half sizes (scene units, z up, floor at 0), yaw and roll (degrees), dark and light texture color (sRGB).
 
-The first is the room, seen from inside; the others are the boxes in it.
+The first is the room, visible from inside; the others are the boxes in it.
 """
-_LIGHT = np.array([0.36, -0.48, 0.80])
-_TEXELS = 96
-"""Texture resolution, texels per scene unit."""
 _SUPERSAMPLING = 3
 _SPARSE_POINTS = 4000
 _SPARSE_NOISE = 0.005
 
 
-class _Face(NamedTuple):
-    """A textured rectangle, seen from the side its normal points to."""
-
-    center: np.ndarray
-    axes: np.ndarray
-    """u, v and the normal as rows, [3, 3]."""
-    half: tuple[float, float]
-    texture: np.ndarray
-    """Display colors, float32 [rows along v, columns along u, 3]."""
-
-
-class _Cuboid(NamedTuple):
-    """The room or a box, with the radius of the sphere around it."""
-
-    center: np.ndarray
-    radius: float
-    faces: list[_Face]
-
-
 @dataclass(frozen=True)
 class DemoScene:
-    """The demo's scene and cameras; everything in it follows from the fields.
+    """The demo's scene and cameras, which the fields determine.
 
     Raises:
         ValueError: a field is out of its range.
@@ -118,50 +98,25 @@ class DemoScene:
         return np.delete(poses, held_out, axis=0), poses[held_out]
 
     def rays(self, camera_to_world: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """World directions [N, 3], of depth 1, through pixel positions [N, 2] (x right, y down, (0, 0) a corner)."""
+        """Return world directions [N, 3], of depth 1, through positions [N, 2] in pixels from the upper left corner."""
         x = (pixels[:, 0] - self.width / 2) / self.focal_length
         y = (self.height / 2 - pixels[:, 1]) / self.focal_length
         return np.stack([x, y, -np.ones_like(x)], axis=1) @ camera_to_world[:3, :3].T
 
     def trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Follows rays to the first surface they meet.
+        """Follow rays to the first surface that they meet.
 
         Args:
-            origin: where all rays start, [3], inside the room and outside the boxes.
+            origin: origin of all rays, [3], inside the room and outside the boxes.
             directions: [N, 3], of any length.
 
         Returns:
             Distance in multiples of `directions` [N] and display color [N, 3] in [0, 1], both float32.
         """
-        rays = np.ascontiguousarray(directions.T, dtype=np.float32)
-        depth = np.full(rays.shape[1], np.inf, dtype=np.float32)
-        color = np.zeros((rays.shape[1], 3), dtype=np.float32)
-        lengths = np.square(rays).sum(axis=0)
-        for cuboid in self._cuboids:
-            offset = (cuboid.center - origin).astype(np.float32)
-            # The square of a ray's way past the bounding sphere's center tells whether it meets the sphere.
-            near = np.flatnonzero(np.square(offset @ rays) >= (offset @ offset - cuboid.radius**2) * lengths)
-            bundle = rays.take(near, axis=1)
-            for face in cuboid.faces:
-                u0, v0, n0 = (face.axes @ (origin - face.center)).astype(np.float32)
-                if n0 <= 0:
-                    continue
-                du, dv, dn = face.axes.astype(np.float32) @ bundle
-                with np.errstate(divide="ignore", invalid="ignore"):
-                    t = -n0 / dn
-                    u, v = u0 + t * du, v0 + t * dv
-                # The margin closes the hairline between faces that share an edge.
-                inside = (np.abs(u) <= face.half[0] + 1e-4) & (np.abs(v) <= face.half[1] + 1e-4)
-                hits = np.flatnonzero(inside & (t > 0) & (t < depth[near]))
-                depth[near[hits]] = t[hits]
-                rows, columns, _ = face.texture.shape
-                row = ((v[hits] + face.half[1]) * _TEXELS).astype(int).clip(0, rows - 1)
-                column = ((u[hits] + face.half[0]) * _TEXELS).astype(int).clip(0, columns - 1)
-                color[near[hits]] = face.texture[row, column]
-        return depth, color
+        return trace(self._cuboids, origin, directions)
 
     def render(self, camera_to_world: np.ndarray) -> np.ndarray:
-        """One camera's clean photo, uint8 [height, width, 3]: 3 x 3 rays a pixel, box-filtered.
+        """Render one camera's clean photo, uint8 [height, width, 3]: 3 x 3 rays per pixel, box-filtered.
 
         Args:
             camera_to_world: [4, 4], OpenGL axes.
@@ -174,7 +129,7 @@ class DemoScene:
         return np.rint(color * 255).astype(np.uint8)
 
     def sparse_points(self) -> tuple[np.ndarray, np.ndarray]:
-        """What structure from motion would find: noisy points on surfaces that training cameras see.
+        """Sample what structure from motion would find: noisy points on surfaces that training cameras see.
 
         Returns:
             Positions [4000, 3] (standard deviation 0.005 scene units) and display colors uint8 [4000, 3].
@@ -191,25 +146,21 @@ class DemoScene:
         return np.concatenate(points) + noise, np.concatenate(colors)
 
     def write(self, output: Path, artifact: Layers | None) -> None:
-        """Writes the capture as a nerfstudio dataset: images/, transforms.json and sparse_pc.ply.
+        """Write the capture as a nerfstudio dataset: images/, transforms.json and sparse_pc.ply.
 
         Args:
             output: folder to make; it appears only when complete, its parent is made where missing.
-            artifact: laid over the training images, or None; test images stay clean.
+            artifact: composited over the training images, or None; test images stay clean.
 
         Raises:
-            FileExistsError: `output` exists already.
+            InputError: `output` exists or cannot be written.
             ValueError: the artifact is not of the images' size.
         """
-        if output.exists():
-            raise FileExistsError(f"{output} exists already: remove it or name another folder")
         if artifact is not None and artifact.transmittance.shape != (self.height, self.width, 3):
             height, width, _ = artifact.transmittance.shape
             raise ValueError(f"artifact is {width} x {height}, the scene's images are {self.width} x {self.height}")
-        output.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as scratch:
-            dataset = Path(scratch) / output.name
-            (dataset / "images").mkdir(parents=True)
+        with staged_folder(output) as dataset:
+            (dataset / "images").mkdir()
             names: dict[str, list[str]] = {}
             for split, poses in zip(("train", "test"), self.cameras, strict=True):
                 names[split] = [f"images/{split}_{number:04d}.png" for number in range(len(poses))]
@@ -220,7 +171,6 @@ class DemoScene:
                     Image.fromarray(photo).save(dataset / name)
             _write_ply(dataset / "sparse_pc.ply", *self.sparse_points())
             (dataset / "transforms.json").write_text(json.dumps(self._transforms(names["train"], names["test"])))
-            dataset.rename(output)
 
     def _transforms(self, train: list[str], test: list[str]) -> dict[str, object]:
         poses = np.concatenate(self.cameras).tolist()
@@ -242,73 +192,13 @@ class DemoScene:
         }
 
     @cached_property
-    def _cuboids(self) -> list[_Cuboid]:
+    def _cuboids(self) -> list[Cuboid]:
         rng = np.random.default_rng([self.seed, 0])
-        return [_cuboid(number, *geometry, rng=rng) for number, geometry in enumerate(_CUBOIDS)]
-
-
-def _cuboid(
-    number: int,
-    center: tuple[float, ...],
-    halves: tuple[float, ...],
-    yaw: float,
-    roll: float,
-    *colors: tuple[int, ...],
-    rng: np.random.Generator,
-) -> _Cuboid:
-    """One row of the table, each face with its own texture and baked light."""
-    (cy, cr), (sy, sr) = np.cos(np.radians([yaw, roll])), np.sin(np.radians([yaw, roll]))
-    rotation = np.array([[cy, -sy * cr, sy * sr], [sy, cy * cr, -cy * sr], [0, sr, cr]])
-    faces = []
-    for side in range(6):
-        axis, sign = side // 2, 2 * (side % 2) - 1
-        u, v = (other for other in range(3) if other != axis)
-        normal = rotation[:, axis] * (-sign if number == 0 else sign)
-        half = (halves[u], halves[v])
-        texture = _texture((number + side) % 6, half, np.array(colors) / 255, rng) * (0.7 + 0.4 * normal @ _LIGHT)
-        middle = np.array(center) + sign * halves[axis] * rotation[:, axis]
-        axes = np.stack([rotation[:, u], rotation[:, v], normal])
-        faces.append(_Face(middle, axes, half, texture.clip(0, 1).astype(np.float32)))
-    return _Cuboid(np.array(center), float(np.linalg.norm(halves)), faces)
-
-
-def _texture(kind: int, half: tuple[float, float], colors: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """One of six patterns between a dark and a light color, under several octaves of value noise.
-
-    Returns:
-        Colors [rows along v, columns along u, 3], about [0, 1].
-    """
-    width, height = (round(2 * side * _TEXELS) for side in half)
-    period = 0.3 * np.sqrt(max(half)) * rng.uniform(0.8, 1.2)
-    y, x = np.mgrid[:height, :width].astype(np.float32) / np.float32(_TEXELS * period)
-    noise = np.zeros((height, width), dtype=np.float32)
-    for octave in range(5):
-        cell = 64 >> octave
-        lattice = Image.fromarray(rng.uniform(-1, 1, (height // cell + 2, width // cell + 2)).astype(np.float32))
-        smooth = lattice.resize((lattice.width * cell, lattice.height * cell), Image.Resampling.BICUBIC)
-        noise += 0.75**octave * np.asarray(smooth)[:height, :width]
-    row = np.floor(y)
-    if kind == 0:  # bricks
-        x = x / 2 + row / 2
-        mask = (x % 1 > 0.06) & (y % 1 > 0.12)
-    elif kind == 1:  # diagonal stripes
-        x = x + 0.5 * y
-        mask = x % 1 > 0.5
-    elif kind == 2:  # dots
-        mask = np.hypot(x % 1 - 0.5, y % 1 - 0.5) < 0.34
-    elif kind == 3:  # planks
-        mask = x % 1 > 0.08
-    elif kind == 4:  # checkers
-        mask = (np.floor(x) + row) % 2 > 0
-    else:  # contours
-        mask = np.sin(9 * noise) > 0
-    tone = rng.uniform(-0.25, 0.25, (64, 64)).astype(np.float32)[row.astype(int) % 64, np.floor(x).astype(int) % 64]
-    blend = np.clip(np.where(mask, 0.8, 0.1) + tone + 0.24 * noise, 0, 1)[..., None]
-    return ((1 - blend) * colors[0] + blend * colors[1]) * rng.uniform(0.94, 1.06, 3)
+        return [make_cuboid(number, *geometry, rng=rng, inside=number == 0) for number, geometry in enumerate(_CUBOIDS)]
 
 
 def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """An ASCII point cloud from positions [N, 3] and colors uint8 [N, 3]."""
+    """Write an ASCII point cloud of positions [N, 3] and colors uint8 [N, 3]."""
     properties = [f"property float {axis}" for axis in "xyz"]
     properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
     header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]

@@ -1,4 +1,4 @@
-"""Training photos with the artifact in front of them, and the true layers beside them."""
+"""Training photos with the artifact in front of them, and files of its true layers."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from ssa_nerfstudio.experiments.simulation.scene import Scene
 
 
 def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path, threads: int) -> Iterator[None]:
-    """Writes the training photos and the layers, one raw frame size after the other; yields after every photo.
+    """Write the training photos and the layers, one raw frame size after the other; yield after every photo.
 
     Args:
         dataset: what to read.
-        scene: what to put in front; not empty.
+        scene: effects to put in front, at least one.
         names: each photo's path in the output.
         folder: the output.
-        threads: photos worked on at once.
+        threads: photos in flight at once.
 
     Raises:
-        InputError: a photo cannot be read or is not as transforms.json says.
+        InputError: a photo cannot be read, or differs in size from transforms.json.
     """
     numbered = [(number, view) for number, view in enumerate(dataset.views) if view.role == "train"]
-    # In the output's order, which is the one that nerfstudio numbers cameras in.
+    # In the output's order, in which nerfstudio numbers cameras.
     cameras = _first_views(sorted((view for _, view in numbered), key=lambda view: Path(names[view.path])))
     (folder / "layers").mkdir()
     raw, straight = (LayerFile(folder / "layers", frame, len(cameras)) for frame in ("raw", "undistorted"))
@@ -59,12 +59,12 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
         for camera, view in enumerate(cameras):
             if view.size == size:
                 both = ((raw, layers), (straight, undistorted_layers(layers, view.lens)))
-                # Compressing them takes as long as dozens of photos.
+                # Their compression takes as long as dozens of photos.
                 list(ordered_map(lambda pair, camera=camera: pair[0].add(camera, pair[1]), both, threads))
 
 
 def undistorted_layers(layers: Layers, lens: Lens) -> Layers:
-    """An artifact of the raw frame in the undistorted, cropped frame: T and B warped like photos, premultiplied."""
+    """Warp an artifact of the raw frame to the undistorted, cropped frame: T and B like photos, premultiplied."""
     # Bilinear weights add up to 1 only within rounding.
     return Layers(undistort(layers.transmittance, lens).clip(0, 1), undistort(layers.addition, lens))
 
@@ -78,7 +78,7 @@ def _first_views(views: list[View]) -> list[View]:
 
 
 class _Mean:
-    """Mean of the layers of many views, which are added in a fixed order so that it always comes out the same."""
+    """Mean of the layers of many views, added in a fixed order so that it is reproducible."""
 
     def __init__(self) -> None:
         self._sums: tuple[np.ndarray, np.ndarray] | None = None

@@ -1,4 +1,4 @@
-"""The true layers as files: T and B as float arrays, and 8-bit pictures to look at."""
+"""Files of the true layers: T and B as float arrays, and as 8-bit pictures."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from ssa_nerfstudio.experiments.effects.layers import Box, Layers
 class LayerFile:
     """An .npz file of T and B for every camera of a rig, written one camera after the other.
 
-    Keys are T and B where there is one camera, else T0, B0, T1, B1, ... : what `overlay: given` reads.
+    Keys are T and B where there is one camera, else T0, B0, T1, B1, ..., as `overlay: given` reads them.
     """
 
     def __init__(self, folder: Path, name: str, cameras: int) -> None:
-        """Take where to write.
+        """Store where to write.
 
         Args:
             folder: exists.
             name: `raw` or `undistorted`.
-            cameras: how many will be added.
+            cameras: number of cameras that will be added.
         """
         self._folder, self._name, self._cameras = folder, name, cameras
 
     def add(self, camera: int, layers: Layers) -> None:
-        """Writes one camera's layers, float32 [H, W, 3] each, and PNG pictures of both (B clipped at 1)."""
+        """Write one camera's layers, float32 [H, W, 3] each, and PNG pictures of both (B clipped at 1)."""
         suffix = str(camera) if self._cameras > 1 else ""
         arrays = {"T": layers.transmittance, "B": layers.addition}
-        # Most layers are constant almost everywhere and shrink to a few percent; mud, the densest, to two thirds.
+        # Most layers are constant almost everywhere and compress to a few percent; mud, the densest, to two thirds.
         path = self._folder / f"{self._name}.npz"
         with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for key, values in arrays.items():
@@ -45,7 +45,7 @@ class LayerFile:
 
 
 def write_view(path: Path, inside: Layers, box: Box, frame: tuple[int, int]) -> None:
-    """Stores what one view has of its own: T and B inside a rectangle, as float16.
+    """Write the layers of one view: T and B inside a rectangle, as float16.
 
     Args:
         path: file to write; its folder is made where missing.
@@ -60,7 +60,7 @@ def write_view(path: Path, inside: Layers, box: Box, frame: tuple[int, int]) -> 
 
 
 def read_view(path: Path, static: Layers) -> Layers:
-    """One view's layers in the raw frame.
+    """Read one view's layers in the raw frame.
 
     Args:
         path: a file of `layers/views/`.

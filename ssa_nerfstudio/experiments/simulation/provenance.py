@@ -1,4 +1,4 @@
-"""What the simulator writes beside the photos: transforms.json with its split, and scene.yaml."""
+"""The simulator's transforms.json, with its split, and scene.yaml."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ssa_nerfstudio.experiments.simulation.scene import Scene
 
 
 def transforms(dataset: Dataset, names: dict[str, str]) -> dict[str, Any]:
-    """transforms.json of the output: the input's, with the split, the photos' new names and the size that was read.
+    """Return the output's transforms.json: the input's, with split, the photos' new names and the size that was read.
 
     Args:
         dataset: the input.
@@ -32,7 +32,7 @@ def transforms(dataset: Dataset, names: dict[str, str]) -> dict[str, Any]:
         meta[f"{split}_filenames"] = [names[path] for path in paths]
     if dataset.downscale_factor > 1:
         for holder in (meta, *meta["frames"]):
-            # Numbers may be stated as texts: nerfstudio takes them, and so do we.
+            # Numbers may be strings: nerfstudio takes them.
             reduced = {
                 key: float(holder[key]) / dataset.downscale_factor
                 for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")
@@ -43,11 +43,11 @@ def transforms(dataset: Dataset, names: dict[str, str]) -> dict[str, Any]:
 
 
 def scene_record(dataset: Dataset, scene: Scene) -> str:
-    """YAML of what was done; it is a scene file itself, and repeats the run.
+    """Return YAML of the effects and their provenance; it is a scene file that repeats the run.
 
     Args:
         dataset: the input.
-        scene: what was put in front.
+        scene: effects that were put in front.
     """
     train, val, test = dataset.split
     versions = {

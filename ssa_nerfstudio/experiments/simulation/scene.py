@@ -1,4 +1,4 @@
-"""A scene names effects, their parameters and a seed; drawn for a frame size it becomes the artifact."""
+"""A scene: effects, their parameters and a seed, from which the artifact of a frame size is drawn."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class SceneFile:
     effects: list[Any]
     """From the scene outwards; each a name, a .yaml file, or keys and values: `effect` and that effect's parameters."""
     seed: int = 0
-    """Decides all that chance decides; not negative."""
+    """Decides everything random; not negative."""
     provenance: dict = field(default_factory=dict)
-    """What wrote the file, where `ssa simulate` did; not read."""
+    """Written by `ssa simulate`; not read."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
@@ -38,7 +38,7 @@ class SceneFile:
 
 @dataclass(frozen=True)
 class Scene:
-    """Effects in front of one another, the last nearest to the eye, and the seed that they are drawn with."""
+    """Effects in front of one another, the last nearest to the camera, and their seed."""
 
     effects: tuple[tuple[str, Effect], ...]
     """Name and parameters of each effect."""
@@ -46,7 +46,7 @@ class Scene:
     """Not negative."""
 
     def draw(self, height: int, width: int) -> Composition:
-        """The artifact at one frame size, pixels; there must be effects."""
+        """Draw the artifact at one frame size, pixels; there must be effects."""
         return Composition(
             [
                 effect.layers(height, width, np.random.default_rng([self.seed, *stream]))
@@ -55,10 +55,10 @@ class Scene:
         )
 
     def view_generators(self, artifact: Composition, view: int) -> list[np.random.Generator]:
-        """What decides the one view's own part of every effect that varies.
+        """Return the generators of one view, one for each effect that varies.
 
         Args:
-            artifact: what `draw` gave.
+            artifact: result of `draw`.
             view: number of the view in the dataset's sorted order.
         """
         return [
@@ -68,20 +68,20 @@ class Scene:
         ]
 
     def describe(self) -> list[dict[str, Any]]:
-        """Each effect with all its parameters, as a scene file states them."""
+        """Return each effect with all its parameters, as a scene file states them."""
         return [
             {"effect": name} | {key: _plain(value) for key, value in dataclasses.asdict(effect).items()}  # type: ignore[call-overload]
             for name, effect in self.effects
         ]
 
     def _streams(self) -> list[tuple[int, int]]:
-        # An effect comes out the same whatever stands beside it; one named twice comes out differently.
+        # The draw of an effect does not depend on the others; an effect named twice is drawn differently.
         names = [name for name, _ in self.effects]
         return [(zlib.crc32(name.encode()), names[:number].count(name)) for number, name in enumerate(names)]
 
 
 def read_effects(names: tuple[str, ...], stated_in: str = "") -> tuple[tuple[str, Effect], ...]:
-    """Effects from shipped names or .yaml files.
+    """Read effects from shipped names or .yaml files.
 
     Args:
         names: names, or paths of .yaml files.
@@ -98,7 +98,7 @@ def read_effects(names: tuple[str, ...], stated_in: str = "") -> tuple[tuple[str
 
 
 def read_scene(name: str) -> Scene:
-    """A scene from a shipped name or a .yaml file.
+    """Read a scene from a shipped name or a .yaml file.
 
     Raises:
         InputError: it cannot be found, or it or an effect that it names is faulty.

@@ -18,16 +18,16 @@ from ssa_nerfstudio.experiments.simulation.scene import Scene
 
 
 def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None:
-    """Writes the dataset with the scene's artifact in front of every training photo.
+    """Write the dataset with the scene's artifact in front of every training photo.
 
     Training photos become PNG: I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits. Everything else is copied
-    byte for byte; without effects that is every file but transforms.json, which only gains the split.
+    byte for byte; without effects that is every file but transforms.json, which gains the split alone.
 
     Args:
-        dataset: what to read.
-        scene: what to put in front.
-        output: folder to make; it appears only when complete.
-        threads: photos worked on at once, at least 1; memory is proportional to it and to the photos' size, not to
+        dataset: the input.
+        scene: effects to put in front.
+        output: folder to make; it appears when complete.
+        threads: photos in flight at once, at least 1; memory is proportional to it and to the photos' size, not to
             their number.
 
     Raises:
@@ -38,7 +38,7 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
     names = {view.path: view.path for view in dataset.views} | renamed
     _check_names(names)
     console = Console()
-    # Where there is no terminal, an ended bar leaves an empty line.
+    # Without a terminal, a finished bar leaves an empty line.
     progress = Progress(console=console, transient=True, disable=not console.is_terminal)
     with staged_folder(output) as folder, progress:
         task = progress.add_task("Simulating", total=len(dataset.views))
@@ -54,7 +54,7 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
             for _ in corrupt(dataset, scene, names, folder, threads):
                 progress.advance(task)
         (folder / "scene.yaml").write_text(scene_record(dataset, scene), encoding="utf-8")
-        # Last, because it is what makes the folder a dataset.
+        # Last, because it makes the folder a dataset.
         (folder / "transforms.json").write_text(json.dumps(transforms(dataset, names), indent=4), encoding="utf-8")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
@@ -227,7 +228,7 @@ def test_nothing_is_left_of_an_interrupted_run(
 
 def test_an_existing_folder_is_kept(scene: DemoScene, dataset: Path) -> None:
     before = (dataset / "transforms.json").stat().st_mtime_ns
-    with pytest.raises(FileExistsError, match="exists already"):
+    with pytest.raises(InputError, match="exists already"):
         scene.write(dataset, None)
     assert (dataset / "transforms.json").stat().st_mtime_ns == before
 
