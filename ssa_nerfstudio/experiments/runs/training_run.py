@@ -92,7 +92,7 @@ def train_and_evaluate(
         config.pipeline._target, config.pipeline.datamanager._target = TimedPipeline, TimedDatamanager
         trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
-        writer.EVENT_WRITERS.clear()  # nobody reads them, and the viewer that they stand in for has none
+        writer.EVENT_WRITERS.clear()  # not read by anything here
         pipeline = cast(TimedPipeline, trainer.pipeline)
         pipeline.read_photos(test_scale)
         judge = partial(evaluate, pipeline, flips)

@@ -276,7 +276,7 @@ def test_a_run_that_fails_says_why(tmp_path, capsys):
     [
         (["nothing"], "benchmarks has no 'nothing'"),
         (["smoke", "--scenes", "garden"], "no scene 'garden'"),
-        (["smoke", "--only", "*-snow-*"], "matches no run"),
+        (["smoke", "--only", "*-snow-*"], "no run's id matches *-snow-*"),
         (["smoke", "--time-limit", "0"], "--time-limit"),
         (["smoke", "--runs-per-device", "0"], "--runs-per-device"),
         (["smoke", "--merge", "nowhere"], "holds no results"),

@@ -38,7 +38,7 @@ def source(data: str) -> Path:
         variable = re.search(r"\$\{?(\w+)", data)
         hint = f" (set {variable[1]} to the folder of captures)" if variable else ""
         raise InputError(
-            f"{path}/transforms.json does not exist{hint}", "put the capture there, or name other scenes with --scenes"
+            f"{path}/transforms.json does not exist{hint}", "put the capture there, or choose other scenes"
         )
     return path
 

@@ -48,11 +48,11 @@ def select(runs: list[Run], scenes: tuple[str, ...], only: tuple[str, ...]) -> l
     known = sorted({run.scene for run in runs})
     for name in scenes:
         if name not in known:
-            raise InputError(f"--scenes: the benchmark has no scene {name!r}", f"choose from {', '.join(known)}")
+            raise InputError(f"the benchmark has no scene {name!r}", f"choose from {', '.join(known)}")
     chosen = [run for run in runs if not scenes or run.scene in scenes]
     chosen = [run for run in chosen if not only or any(fnmatchcase(run.id, pattern) for pattern in only)]
     if not chosen:
-        raise InputError(f"--only {' '.join(only)} matches no run", "--list shows their ids")
+        raise InputError(f"no run's id matches {' '.join(only)}", "list the ids of the runs first")
     return chosen
 
 
@@ -145,5 +145,5 @@ def reach(folder: Path) -> ResultsFolder:
         InputError: the path is a file.
     """
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"{folder} is a file", "name a folder with --output")
+        raise InputError(f"{folder} is a file", "choose another output folder")
     return ResultsFolder(folder)

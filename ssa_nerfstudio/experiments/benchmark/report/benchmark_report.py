@@ -43,7 +43,7 @@ def report(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
     """
     for folder in folders:
         if not (folder / "results").is_dir():
-            raise InputError(f"{folder} holds no results", "name the --output folder of ssa bench")
+            raise InputError(f"{folder} holds no results", "choose the output folder of ssa bench")
     results, problems = read_all(folders)
     if not any(result.status != "failed" and not result.run.marks for result in results):
         raise InputError(f"{folders[0]}/results holds no result of ssa bench that ended", "run ssa bench first")

@@ -1,4 +1,4 @@
-"""Quality against seconds: which points nobody beats, where more seconds stop paying, and what a decibel costs."""
+"""Quality against seconds: the Pareto frontier, its knee, and what a decibel costs."""
 
 from __future__ import annotations
 

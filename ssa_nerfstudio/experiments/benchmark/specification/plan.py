@@ -77,7 +77,7 @@ class Run:
 def plan(benchmark: Benchmark) -> list[Run]:
     """The runs of all parts in their order, each once.
 
-    Left out is what means nothing: the true overlay of clean photos, and of real artifacts, which nobody knows.
+    Left out is the oracle overlay of clean photos, which have none, and of real artifacts, whose layers are unknown.
     """
     runs: dict[str, Run] = {}
     for part in benchmark.parts:
