@@ -18,7 +18,7 @@ from pydantic_core import ErrorDetails
 
 from ssa_nerfstudio.errors import InputError
 
-Kind = Literal["effects", "scenes", "benchmarks"]
+Kind = Literal["effects", "scenes", "benchmarks", "published"]
 """The shipped folders of configurations."""
 T = TypeVar("T")
 
