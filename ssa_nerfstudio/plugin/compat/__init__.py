@@ -19,5 +19,6 @@ What the next versions will break:
   where `nonfinite` passes a tensor. 1.5.3 never resets opacities under ADC (operator precedence in
   `strategy/default.py`): do not move to it.
 - nerfstudio main: splatfacto has an MCMC option of its own, which `settings.strategy` would shadow.
-- torch: `torch._fused_adam_` and `torch._foreach_add_` are private (`versions.WRITTEN_FOR`).
+- torch: `_fused_adam_`, `_foreach_add_` and `_amp_foreach_non_finite_check_and_unscale_` are private
+  (`versions.WRITTEN_FOR` bounds the version).
 """

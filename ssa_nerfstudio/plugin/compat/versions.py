@@ -11,7 +11,8 @@ from packaging.version import Version
 WRITTEN_FOR = {
     "nerfstudio": ("1.1.5", "1.1.6"),
     "gsplat": ("1.4.0", "1.4.1"),
-    # FusedAdam calls the private `torch._fused_adam_` and `torch._foreach_add_`.
+    # Private functions in use: `_fused_adam_` and `_foreach_add_` (fused_adam),
+    # `_amp_foreach_non_finite_check_and_unscale_` (nonfinite).
     "torch": ("2.6", "2.15"),
 }
 """Lowest version of each package, and the first that is not covered: the bounds of pyproject.toml."""

@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
-from torch.nn.utils import get_total_norm
 
 from ssa_nerfstudio.errors import TrainingError
 
@@ -67,21 +66,26 @@ class NonFiniteGuard:
 
         Args:
             loss: the step's loss [].
-            optimizers: all of them by name, also those that only accumulate gradients at this step.
+            optimizers: all of them by name, also those that only accumulate gradients at this step. No two gradients
+                may share memory.
         """
         if self._judged == 0:
             # New storage, because what the previous window returned may still be in use on the device.
-            rows = loss.new_empty(2, CHECK_EVERY, dtype=torch.float32, requires_grad=False)
+            rows = loss.new_zeros(2, CHECK_EVERY, dtype=torch.float32, requires_grad=False)
+            self._factors = loss.new_tensor([SQUARE_LIMIT, 1 / SQUARE_LIMIT], dtype=torch.float32).unbind()
             self._taken, self._skipped = rows
             self._verdicts = [Verdict(*pair) for pair in zip(*(row.unbind() for row in rows), strict=True)]
         self._optimizers, self._loss = optimizers, loss.detach()
         verdict = self._verdicts[self._judged]
         self._judged += 1
         # Densification replaces parameters, so the list is made anew.
-        gradients = [p.grad for _, p in _parameters(optimizers) if p.grad is not None]
-        largest = get_total_norm([self._loss.reshape(1), *gradients], math.inf)
-        torch.lt(largest, SQUARE_LIMIT, out=verdict.taken)  # false for NaN, too
-        torch.logical_not(verdict.taken, out=verdict.skipped)
+        values = [self._loss, *(p.grad for _, p in _parameters(optimizers) if p.grad is not None)]
+        # One kernel over a list of tensors sets `skipped` where a value is not finite, and multiplies all of them. The
+        # second call finds what overflowed in the first, and restores all other values: powers of two round nothing.
+        search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
+        for factor in self._factors:
+            search(values, verdict.skipped, factor)
+        torch.logical_not(verdict.skipped, out=verdict.taken)
         return verdict
 
     def mask_densification(self, info: dict[str, Any]) -> None:
