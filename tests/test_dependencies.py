@@ -22,6 +22,7 @@ OPTIONAL = {
     "triton": "comes with torch for CUDA",
     "pillow_heif": "the extra heic",
     "pydantic_core": "comes with pydantic",
+    "markupsafe": "comes with jinja2",
 }
 
 
