@@ -87,19 +87,18 @@ def check_product(capture: Path, scratch: Path) -> None:
 
 
 def check_missing_extra(capture: Path, scratch: Path) -> None:
-    """A command of the experiments names the extra in one line."""
+    """A command that needs a package of the extra names the extra in one line.
+
+    nerfstudio brings matplotlib, psutil and others along, so that `ssa demo` and `ssa report` work without it, too.
+    """
     output = scratch / "out"
-    arguments = {
-        "bench": ["smoke", "--output", output],
-        "demo": ["--output", output],
-        "report": [scratch],
-        "simulate": ["--data", capture, "--output", output, "--effects", "mud"],
-        "tradeoff": ["smoke", "--output", output],
-    }
-    for command in EXPERIMENTS:
-        told = run("ssa", command, *arguments[command], code=2).strip()
+    for command in (
+        ("bench", "smoke", "--output", output),
+        ("tradeoff", "smoke", "--output", output),
+        ("simulate", "--data", capture, "--output", output, "--effects", "mud"),
+    ):
+        told = run("ssa", *command, code=2).strip()
         assert "pip install 'ssa-nerfstudio[experiments]'" in told, told
-        assert "Traceback" not in told
         assert len(told.splitlines()) == 1, told
 
 
