@@ -91,13 +91,8 @@ def check_missing_extra(capture: Path, scratch: Path) -> None:
 
     nerfstudio brings matplotlib, psutil and others along, so that `ssa demo` and `ssa report` work without it, too.
     """
-    output = scratch / "out"
-    for command in (
-        ("bench", "smoke", "--output", output),
-        ("tradeoff", "smoke", "--output", output),
-        ("simulate", "--data", capture, "--output", output, "--effects", "mud"),
-    ):
-        told = run("ssa", *command, code=2).strip()
+    for command in (("bench", "smoke"), ("tradeoff", "smoke"), ("simulate", "--data", capture, "--effects", "mud")):
+        told = run("ssa", *command, "--output", scratch / f"{command[0]}-output", code=2).strip()
         assert "pip install 'ssa-nerfstudio[experiments]'" in told, told
         assert len(told.splitlines()) == 1, told
 
