@@ -18,6 +18,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
 from ssa_nerfstudio.experiments.runs.machine import versions
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.plugin.trainer import SSATrainer
@@ -52,14 +53,11 @@ class Command:
             for _ in range(self.grow):
                 training.step()
             times = np.array([self._pair(training, k) for k in range(self.pairs)])[2:]
-        percent = 100 * (times[:, 1] / times[:, 0] - 1)
-        draws = np.random.default_rng(0).choice(percent, (10_000, len(percent)))
-        low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
         without = 1e3 * np.median(times[:, 0]) / CHECK_EVERY
         gaussians = training.trainer.pipeline.model.num_points
         print(
             f"{self.method}, overlay {self.overlay}, {gaussians} Gaussians, {versions()['device']}: {without:.3f} ms a "
-            f"step without guards; with them {np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
+            f"step without guards; with them {percent_change(times[:, 1], times[:, 0])}"
         )
 
     def _pair(self, training: Training, pair: int) -> list[float]:

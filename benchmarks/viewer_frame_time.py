@@ -21,6 +21,7 @@ from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
 from ssa_nerfstudio.experiments.runs.machine import versions
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
@@ -82,7 +83,7 @@ class Command:
         where = f"{model.num_points} Gaussians, {self.width} x {self.height}, {versions()['device']}"
         print(f"without an overlay: {milliseconds:.2f} ms a frame ({where})")
         for kind in ("off", "shown"):
-            print(f"{kind}: {_ratio(times[kind], times['without'])}")
+            print(f"{kind}: {percent_change(times[kind], times['without'])}")
 
 
 def _in_a_viewer(work: Callable[[], None]) -> None:
@@ -104,13 +105,6 @@ def _in_a_viewer(work: Callable[[], None]) -> None:
     thread.join()
     if failed:
         raise failed[0]
-
-
-def _ratio(times: np.ndarray, reference: np.ndarray) -> str:
-    percent = 100 * (times / reference - 1)
-    draws = np.random.default_rng(0).choice(percent, (2_000, len(percent)))
-    low, high = np.percentile(np.median(draws, axis=1), [2.5, 97.5])
-    return f"{np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
 
 
 def _wait() -> None:

@@ -81,8 +81,8 @@ class Checkpoint:
         prefix = "artifacts."
         if not len(self.model.get(f"{prefix}camera_keys", ())):
             raise InputError(
-                f"{self.path} has no overlay: it was trained with the overlay off or by another method",
-                "train it with ssa-splatfacto",
+                f"{self.path} has no overlay: none was detected, the overlay was off, or another method trained it",
+                "train ssa-splatfacto with the overlay on",
             )
         artifacts = Artifacts().eval()
         artifacts.allocate(self.model, prefix, wanted=True)

@@ -30,12 +30,17 @@ def sparsity_loss(matte: Tensor, evidence: Tensor, kind: Sparsity) -> Tensor:
 
     Returns:
         A scalar in [0, 1].
+
+    Raises:
+        ValueError: there is no such term.
     """
     if kind == "off":
         return matte.new_zeros(())
     if kind == "l1":
         return matte.mean()
-    return _LogSparsity.apply(matte, evidence)  # pyright: ignore[reportReturnType]
+    if kind == "log":
+        return _LogSparsity.apply(matte, evidence)  # pyright: ignore[reportReturnType]
+    raise ValueError(f"unknown sparsity term {kind!r}; choose l1, log or off")
 
 
 class _LogSparsity(torch.autograd.Function):

@@ -67,7 +67,7 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """Camera and photo of one training view; every view once before any comes again.
 
-        The camera's metadata hold what `cameras.prepare` put there.
+        The camera's metadata hold what `view_geometry.prepare` put there.
         """
         photos = self.cached_train
         if self._train_views is None:

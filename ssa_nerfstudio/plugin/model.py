@@ -43,7 +43,7 @@ class SSASplatfactoModelConfig(ModelSettings):
 class SSASplatfactoModel(SplatfactoModel):
     """Gaussian splats and, per camera group, the artifact in front of them. `rgb` is the clean render everywhere.
 
-    The artifacts come from the pipeline (`artifacts.put`), or from a checkpoint, whose shapes they take.
+    The artifacts come from the pipeline (`artifacts.assign`), or from a checkpoint, whose shapes they take.
     """
 
     config: SSASplatfactoModelConfig

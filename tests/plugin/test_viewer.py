@@ -160,13 +160,13 @@ def test_what_is_off_costs_nothing(model, camera, monkeypatch):
     asked = []
     original = Artifacts.layers_of_camera
     monkeypatch.setattr(Artifacts, "layers_of_camera", lambda self, *a: asked.append(a) or original(self, *a))
-    model.overlay._told = float("inf")
+    model.overlay._summarized = float("inf")
     seen = frame(model, camera)
     assert not asked
     assert seen["composite"].shape == (48, 64, 3)
     assert seen["overlay_alpha"].shape == (48, 64, 1)
     assert len(asked) == 1
-    model.overlay._told = 0.0
+    model.overlay._summarized = 0.0
 
 
 def test_one_overlay_of_a_rig_can_be_chosen(model, camera, monkeypatch):

@@ -1,7 +1,8 @@
-"""Every decision about values that are not finite: steps, Gaussians, seed points, checkpoints.
+"""Decisions of a training about values that are not finite: steps, Gaussians, seed points, checkpoints.
 
 A step is judged on the device; the host reads the verdicts every `CHECK_EVERY` steps, so that no step waits for it.
-None of this is part of the method. `guards: False` in the model's settings switches all of it off.
+None of this is part of the method. `guards: False` in the model's settings switches off all but the checks of seed
+points and checkpoints.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class NonFiniteGuard:
         """Keep the step that was judged last out of the densification, if it was skipped.
 
         Args:
-            info: the rasterizer's. No Gaussian of a skipped step has a radius, and MCMC's noise has no amplitude.
+            info: the rasterizer's. A skipped step sets `radii` to 0 and adds `noise_scale` 0, else 1.
         """
         taken = self._verdicts[self._judged - 1].taken
         info["radii"] = info["radii"] * taken  # as float32: a cast would be one more launch

@@ -78,7 +78,7 @@ def _overview(results: list[Result], planned: set[str], problems: list[str], fol
         f"Made by `ssa report {' '.join(shlex.quote(str(folder)) for folder in folders)}` from {len(results)} runs: "
         f"{counts['finished']} finished, {counts['diverged']} diverged (†, left out of means), {counts['failed']} "
         f"failed; {absence(results, planned)}. Every run's JSON holds its command.",
-        "PSNR, SSIM (valid padding), FLIP and mean color deviation (0 to 255) compare the *clean* render with "
+        "PSNR, SSIM (valid padding), FLIP and mean color deviation (0 to 255) compare the clean render with "
         "clean test views that no training saw.",
     ]
     made = Counter(

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy import stats
 
 DRAWS = 2000
 """Resamples of a bootstrap interval: its ends then move by about a thirtieth of its width."""
@@ -59,3 +60,11 @@ def paired_differences(
 def spread(values: Sequence[float]) -> float | None:
     """Sample standard deviation; None for fewer than two values."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else None
+
+
+def percent_change(times: np.ndarray, reference: np.ndarray) -> str:
+    """Median change of paired times [N] in percent with its 95 % bootstrap interval, as text."""
+    percent = 100 * (times / reference - 1)
+    found = stats.bootstrap((percent,), np.median, method="percentile", rng=np.random.default_rng(0))
+    low, high = found.confidence_interval
+    return f"{np.median(percent):+.2f} % (95 %: {low:+.2f} to {high:+.2f} %)"
