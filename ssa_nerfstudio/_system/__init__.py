@@ -1,1 +1,1 @@
-"""Locks, child processes and threads: what is neither the field nor the framework."""
+"""Locks, child processes and threads: independent of the method and of nerfstudio."""

@@ -1,7 +1,7 @@
 """The null distribution of static edges: the capture itself with its blocks of views shifted at random.
 
-Shifts by a few pixels keep what chance and habit bring about (a horizon at the same height, an object always in the
-middle, vignetting) and lose only what stays in place to the pixel. docs/detect.md derives it.
+Shifts by a few pixels keep chance alignments and the regularities of a capture (a horizon at one height, a centered
+object, vignetting) and destroy only alignment to the pixel. docs/detect.md derives it.
 """
 
 from __future__ import annotations

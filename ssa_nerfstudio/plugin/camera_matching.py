@@ -36,7 +36,7 @@ def match_camera(camera: Cameras, keys: list[list[float]]) -> int | None:
 
 
 def find_frame(key: Tensor, keys: Tensor) -> int | None:
-    """The row of keys [G, 6] that is a camera [6]'s: same size and nearest intrinsics, None where no size is."""
+    """Row of keys [G, 6] with a camera's [6] frame size and the nearest intrinsics; None without one of its size."""
     same_size = (keys[:, :2] == key[:2]).all(dim=1)
     if not same_size.any():
         return None

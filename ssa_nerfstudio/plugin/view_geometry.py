@@ -22,7 +22,7 @@ def frame(camera: Cameras) -> tuple[int, int]:
 def intrinsics(camera: Cameras, reduction: int) -> Tensor:
     """Ks [1, 3, 3] in pixels of an image reduced by a whole factor."""
     prepared = metadata(camera).get("Ks")
-    if prepared is not None:
+    if prepared is not None and reduction in prepared:
         return prepared[reduction]
     Ks = camera.get_intrinsics_matrices().reshape(1, 3, 3).to(camera.device)
     Ks[:, :2] /= reduction

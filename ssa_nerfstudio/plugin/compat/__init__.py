@@ -16,7 +16,7 @@ What the next versions will break:
 - gsplat 1.5 and main: `info["radii"]` has two columns ([C, N, 2], one radius per axis), which
   `densification._update_state` reads as one; `info` counts `n_images`, not `n_cameras`; relocation takes
   `min_opacity` from the strategy; `inject_noise_to_position` reads its scaler as a number, which waits for the device
-  where `nonfinite` passes a tensor. 1.5.3 never resets opacities under ADC (operator precedence in
+  where `langevin_noise` passes a tensor. 1.5.3 never resets opacities under ADC (operator precedence in
   `strategy/default.py`): do not move to it.
 - nerfstudio main: splatfacto has an MCMC option of its own, which `settings.strategy` would shadow.
 - torch: `_fused_adam_`, `_foreach_add_` and `_amp_foreach_non_finite_check_and_unscale_` are private
