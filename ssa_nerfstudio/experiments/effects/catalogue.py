@@ -24,10 +24,18 @@ EFFECTS = {
 
 
 class Effect(Protocol):
-    """A frozen dataclass of parameters that draws an artifact for any frame."""
+    """A frozen pydantic dataclass of parameters, which raises ValueError for values out of range."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers | VaryingLayers:
-        """Draw the artifact at one frame size, pixels; `rng` decides everything random."""
+        """Draw the artifact at one frame size.
+
+        Args:
+            height, width: of the frame, pixels, at least 1.
+            rng: decides everything random.
+
+        Raises:
+            InputError: the effect needs a package that is not installed.
+        """
         ...
 
 

@@ -18,9 +18,7 @@ class Dashboard:
     """A dashcam's view of the car: padded panel, instrument cluster with two gauges, steering wheel, screen.
 
     Opaque but for the soft edge (paper, synthetic artifacts: "Dashboard"). Nothing lies above `height`.
-
-    Raises:
-        ValueError: a field is out of its range.
+    Formation: I = T C + B with T = 1 - A and B = A W, A the matte and W the dashboard's colors.
     """
 
     height: Annotated[float, Field(gt=0, le=0.5)] = 0.32
@@ -41,16 +39,7 @@ class Dashboard:
     """Screen in the middle of the car, sRGB, 0..255."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the dashboard at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: sets the needles and the grain of the panel.
-
-        Returns:
-            T = 1 - A and B = A W, with A the matte and W the dashboard's colors.
-        """
+        """Draw the dashboard; `rng` sets the needles and the grain of the panel."""
         painter = _Painter(height, width, self.height * height)
         x, y = painter.x, painter.y
         # Distances are in the dashboard's height, y upwards from the frame's lower edge, x from its middle.

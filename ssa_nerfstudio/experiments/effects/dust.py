@@ -21,9 +21,6 @@ class Dust:
     """Specks and fibres scattered over the frame, each dimming what is behind it.
 
     Formation: I = T C, T the product over particles of 1 - opacity times coverage, the same for all channels; B = 0.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     specks: Annotated[int, Field(ge=0, le=10_000)] = 60
@@ -38,13 +35,7 @@ class Dust:
     """Width of a speck's edge as a fraction of its radius, in (0, 1]."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the dust at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: places, sizes and densities of the particles.
-        """
+        """Draw the dust; `rng` decides places, sizes and densities of the particles."""
         transmittance = np.ones((height, width))
         largest = self.radius * np.hypot(height, width)
         for _ in range(self.specks):

@@ -21,9 +21,6 @@ class Finger:
 
     Formation in view i: I = T C + B_i with T = 1 - A, the same in all views, and B_i = A W_i. The finger's color W_i
     is its skin under light that changes in brightness, tint and direction from view to view.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     side: Literal["left", "right", "top", "bottom"] = "right"
@@ -44,13 +41,7 @@ class Finger:
     """Standard deviation, from view to view, of the light's brightness relative to its mean, in [0, 0.5]."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> VaryingLayers:
-        """Draw the finger at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: the finger's tilt.
-        """
+        """Draw the finger; `rng` decides its tilt."""
         short, outward = min(height, width), np.array(_OUTWARD[self.side], float)
         middle = np.array([width, height]) * np.where(outward == 0, self.position, (outward + 1) / 2)
         tilt = rng.uniform(-0.35, 0.35)

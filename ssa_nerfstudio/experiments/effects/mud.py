@@ -16,9 +16,6 @@ class Mud(SpatterEffect):
 
     Formation: I = T C + B with T = 1 - A and B = A color: alpha compositing. A channel where the color is black
     also has T = 1 - A.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     intensity: Share = 0.6
@@ -27,15 +24,6 @@ class Mud(SpatterEffect):
     """Spatter's `color`, sRGB, 0..255. Brown; albumentations' own default, (20, 42, 63), is a blue."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the mud at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: seeds the mud.
-
-        Raises:
-            InputError: albumentations is not installed.
-        """
+        """Draw the mud, which `rng` seeds; as `SpatterEffect._draw`, needs albumentations."""
         drawn = self._draw("mud", height, width, rng)
         return Layers(drawn["non_mud"], drawn["mud"])

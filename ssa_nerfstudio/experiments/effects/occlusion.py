@@ -24,9 +24,6 @@ class Occlusion:
 
     Formation in view i: I = T_i C + B_i with T_i = 1 - A_i and B_i = A_i W_i. A_i is one matte, shifted by a few
     pixels; W_i is the arm's color with highlights whose place, brightness and tint are the view's own.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     corner: Literal["bottom-left", "bottom-right", "top-left", "top-right"] = "bottom-left"
@@ -45,13 +42,7 @@ class Occlusion:
     """Brightness of the strongest highlight, in [0, 1]; each view has between 0.3 and 1 of it."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> VaryingLayers:
-        """Draw the arm at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: the arm's direction.
-        """
+        """Draw the arm; `rng` decides its direction."""
         short, down, right = min(height, width), self.corner.startswith("bottom"), self.corner.endswith("right")
         angle, half = rng.uniform(0.6, 0.95), self.thickness * short / 2
         edge, sway = edge_width(self.blur, short), _MAX_SWAY * self.drift

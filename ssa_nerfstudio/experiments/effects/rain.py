@@ -15,9 +15,6 @@ class Rain(SpatterEffect):
     """The paper's "Rain spots": `Spatter` in its rain mode, drawn once for all views. A stand-in for real drops.
 
     Formation: I = clip(C + B), T = 1, B = drops times color. Real drops refract the scene; these only brighten it.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     intensity: Share = 0.6
@@ -26,14 +23,5 @@ class Rain(SpatterEffect):
     """Spatter's `color`: of the added light, sRGB, 0..255; its own default, a pale yellow."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the drops at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: seeds the drops.
-
-        Raises:
-            InputError: albumentations is not installed.
-        """
+        """Draw the drops, which `rng` seeds; as `SpatterEffect._draw`, needs albumentations."""
         return Layers(np.ones((height, width, 3), np.float32), self._draw("rain", height, width, rng)["drops"])

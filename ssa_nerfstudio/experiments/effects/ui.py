@@ -23,9 +23,6 @@ class UI:
 
     Formation: I = T C + B with T = 1 - A and B = A W, both in steps of 1 / 255: panels are translucent, what is drawn
     on them is opaque.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     scale: Annotated[float, Field(ge=0.2, le=1)] = 1.0
@@ -42,13 +39,7 @@ class UI:
     """The line at the upper edge; may be empty."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the interface at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: fill of the bars, score, and the minimap's roads.
-        """
+        """Draw the interface; `rng` decides the fill of the bars, the score, and the minimap's roads."""
         fine = _FINE if height * width <= 2**20 else _FINE // 2
         painter = _Painter(height * fine, width * fine, self)
         painter.status(rng.uniform(0.35, 0.95, 3))

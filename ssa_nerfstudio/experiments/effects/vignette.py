@@ -18,9 +18,6 @@ class Vignette:
     """A radial falloff about the frame's center, the same for all channels.
 
     Formation: I = T C with T = 1 - strength s^2 (3 - 2 s), s rising from 0 at `start` to 1 in the corners; B = 0.
-
-    Raises:
-        ValueError: a field is out of its range.
     """
 
     strength: Share = 0.75
@@ -29,13 +26,7 @@ class Vignette:
     """Radius at which the falloff starts, as a fraction of the way from center to corner, in [0, 1)."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the vignette at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: not used; a vignette is not random.
-        """
+        """Draw the vignette, which is not random: `rng` is not used."""
         x, y = pixel_centers(height, width)
         radius = np.hypot(x - width / 2, y - height / 2) / np.hypot(width / 2, height / 2)
         s = np.clip((radius - self.start) / (1 - self.start), 0, 1)

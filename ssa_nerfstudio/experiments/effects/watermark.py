@@ -19,8 +19,7 @@ _OVERSAMPLING = 4
 class Watermark:
     """Stock footage's watermark, composited at one opacity over every frame (paper, synthetic artifacts).
 
-    Raises:
-        ValueError: a field is out of its range.
+    Formation: I = T C + B with T = 1 - A and B = A color, A = alpha times the mark's coverage of the pixel.
     """
 
     alpha: Share = 0.4
@@ -33,16 +32,7 @@ class Watermark:
     """The line beneath the logo; not empty."""
 
     def layers(self, height: int, width: int, rng: np.random.Generator) -> Layers:
-        """Draw the watermark at one frame size.
-
-        Args:
-            height: frame height, pixels, at least 1.
-            width: frame width, pixels, at least 1.
-            rng: not used; a watermark is not random.
-
-        Returns:
-            T = 1 - A and B = A color, with A = alpha times the mark's coverage of the pixel.
-        """
+        """Draw the watermark, which is not random: `rng` is not used."""
         return Layers.composited(self.alpha * self._coverage(height, width), np.array(self.color) / 255)
 
     def _coverage(self, height: int, width: int) -> np.ndarray:
