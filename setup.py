@@ -1,4 +1,4 @@
-"""Ships configs/ as ssa_nerfstudio/configs, and HTML templates; pyproject.toml holds all else."""
+"""Ships configs/ as ssa_nerfstudio/configs, and the templates of pages; pyproject.toml holds all else."""
 
 from setuptools import find_namespace_packages, find_packages, setup
 
@@ -7,7 +7,7 @@ setup(
     packages=[*find_packages(include=["ssa_nerfstudio*"]), *configs],
     package_dir={"ssa_nerfstudio.configs": "configs"},
     package_data={
-        "ssa_nerfstudio.experiments": ["templates/*.html"],
+        "ssa_nerfstudio.experiments": ["templates/*"],
         **{name: ["*.yaml"] for name in configs},
     },
 )

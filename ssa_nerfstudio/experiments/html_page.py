@@ -1,4 +1,4 @@
-"""HTML pages from the templates beside this module; a page embeds its pictures and needs no other file."""
+"""Pages from the templates beside this module; one of HTML embeds its pictures and needs no other file."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Environment, FileSystemLoader, select_autoescape
 from markupsafe import Markup, escape
 
 _MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".svg": "image/svg+xml"}
@@ -18,12 +18,12 @@ def render_page(template: str, title: str, **values: Any) -> str:
     """Render a page.
 
     Args:
-        template: file in `templates/`, which extends base.html.
+        template: file in `templates/`; one of HTML extends base.html.
         title: of the page.
-        values: what the template shows; text is escaped.
+        values: what the template shows; HTML escapes text.
 
     Returns:
-        The page as HTML.
+        The page as text.
     """
     return _environment().get_template(template).render(title=title, **values)
 
@@ -31,7 +31,7 @@ def render_page(template: str, title: str, **values: Any) -> str:
 @functools.cache
 def _environment() -> Environment:
     loader = FileSystemLoader(Path(__file__).parent / "templates")
-    environment = Environment(loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment = Environment(loader=loader, autoescape=select_autoescape(), trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"inline": _inline, "embedded": _embedded}
     return environment
 

@@ -120,7 +120,8 @@ def test_other_lengths_and_other_artifacts_are_tables_of_their_own():
 
 
 def _paper_report(tmp_path, steps: int) -> str:
-    part = Part(methods=("3dgs", "paper"), effects=("none", "mud"), densification=("adc", "mcmc"), steps=steps)
+    methods = ("3dgs", "paper", "l1-0", "constant-start")
+    part = Part(methods=methods, effects=("none", "mud"), densification=("adc", "mcmc"), steps=steps)
     made = benchmark(parts=(part,), protocol="paper")
     runs = plan(made)
     folder_of(tmp_path, [result(run) for run in runs])
@@ -132,6 +133,10 @@ def _paper_report(tmp_path, steps: int) -> str:
 def test_the_papers_figures_stand_beside_ours_where_the_protocol_is_the_same(tmp_path):
     assert "23.21 / 22.84 | 0.708 / 0.742" in _paper_report(tmp_path / "same", 30_000)
     assert "23.21" not in _paper_report(tmp_path / "shorter", 7000)
+
+
+def test_the_papers_ablation_stands_beside_ours_with_its_color_deviation(tmp_path):
+    assert "| the paper, MCMC | 29.00 | 0.869 | 0.122 | 3.19 |" in _paper_report(tmp_path, 30_000).replace("|   ", "| ")
 
 
 def test_the_papers_means_are_those_of_its_rows():

@@ -11,7 +11,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report import category_tables, detail_tables, difference_tables
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
 from ssa_nerfstudio.experiments.benchmark.report.picture_sheets import sheet
-from ssa_nerfstudio.experiments.benchmark.report.study import CLEAN, Study, studies
+from ssa_nerfstudio.experiments.benchmark.report.study import Study, studies
 from ssa_nerfstudio.experiments.benchmark.results import Result, absence, read_all
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
@@ -124,7 +124,7 @@ def _section(study: Study, with_paper: bool) -> Section:
 def _sheets(study: Study, folders: list[Path], output: Path) -> list[Picture]:
     """A sheet for every scene and artifact: the first seed of every method, ADC where it was run."""
     pictures = []
-    for effect, scene in [*study.pairs, *((CLEAN, scene) for scene in study.scenes)]:
+    for effect, scene in study.subjects:
         for densification in study.densifications:
             columns = []
             for method in study.methods:

@@ -45,29 +45,8 @@ class Document:
     def write(self, folder: Path, name: str) -> list[Path]:
         """Writes NAME.md and NAME.html, pictures linked in the one and embedded in the other; the two files."""
         folder.mkdir(parents=True, exist_ok=True)
-        markdown, page = folder / f"{name}.md", folder / f"{name}.html"
-        markdown.write_text(self.markdown(folder), encoding="utf-8")
-        page.write_text(self.html(), encoding="utf-8")
-        return [markdown, page]
-
-    def markdown(self, folder: Path) -> str:
-        """The document as Markdown whose pictures are linked relative to a folder."""
-        blocks = [f"# {self.title}"]
-        for section in self.sections:
-            blocks += [f"## {section.title}", *section.text]
-            for item in section.contents:
-                if isinstance(item, Picture):
-                    blocks.append(f"![{item.caption}]({item.path.relative_to(folder)})\n\n*{item.caption}*")
-                else:
-                    blocks.append(_markdown_table(item))
-        return "\n\n".join(block for block in blocks if block) + "\n"
-
-    def html(self) -> str:
-        """The document as one page that needs no other file."""
-        return render_page("benchmark.html", self.title, sections=self.sections)
-
-
-def _markdown_table(table: Table) -> str:
-    lines = [table.headings, ["---"] * len(table.headings), *table.rows]
-    text = "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-    return "\n\n".join(part for part in (f"### {table.title}", table.note, text) if part)
+        paths = [folder / f"{name}.md", folder / f"{name}.html"]
+        for path in paths:
+            text = render_page(f"benchmark{path.suffix}", self.title, sections=self.sections, folder=folder)
+            path.write_text(text, encoding="utf-8")
+        return paths

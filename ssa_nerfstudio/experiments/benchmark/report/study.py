@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import statistics
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, category
@@ -38,9 +40,13 @@ class Study:
     @property
     def title(self) -> str:
         """For headings."""
-        return f"{self.steps:,} steps" + (
-            f", other artifacts (effect seed {self.effect_seed})" * bool(self.effect_seed)
-        )
+        other = f", other artifacts (effect seed {self.effect_seed})" if self.effect_seed else ""
+        return f"{self.steps:,} steps{other}"
+
+    @property
+    def real(self) -> bool:
+        """Whether all photos carry the artifact themselves."""
+        return all(result.run.real for result in self.results)
 
     @property
     def methods(self) -> list[str]:
@@ -53,6 +59,11 @@ class Study:
         """Artifacts in the paper's order, clean photos apart."""
         present = {category(result.run.effect) for result in self.results} - {CLEAN}
         return sorted(present, key=lambda name: (_position(name), name))
+
+    @property
+    def kinds(self) -> list[str]:
+        """The categories, and `mean` where there are several."""
+        return [*self.categories, *([MEAN] if len(self.categories) > 1 else [])]
 
     @property
     def densifications(self) -> list[str]:
@@ -70,35 +81,36 @@ class Study:
         found = {(r.run.effect, r.run.scene) for r in self.results if r.run.effect != CLEAN}
         return sorted(found, key=lambda pair: (_position(category(pair[0])), pair))
 
+    @property
+    def subjects(self) -> list[tuple[str, str]]:
+        """`pairs`, and every scene without an artifact."""
+        return [*self.pairs, *((CLEAN, scene) for scene in self.scenes)]
+
     def select(self, effect: str, scene: str, method: str, densification: str) -> list[Result]:
         """The seeds of one cell, by seed."""
         key = (effect, scene, method, densification)
         chosen = [r for r in self.results if (r.run.effect, r.run.scene, r.run.method, r.run.densification) == key]
         return sorted(chosen, key=lambda r: r.run.seed)
 
+    def rows(self, results: list[Result]) -> Iterator[tuple[str, str, list[Result]]]:
+        """Every method and densification that some of these results have, with those."""
+        for key in product(self.methods, self.densifications):
+            chosen = [r for r in results if (r.run.method, r.run.densification) == key]
+            if chosen:
+                yield *key, chosen
+
     def value(self, kind: str, method: str, densification: str, metric: str) -> Value | None:
         """Mean of a metric over the scenes of a category (`mean`: of all artifacts; `none`: clean photos).
 
         None where there is nothing to average.
         """
-        pairs = [
-            (effect, scene)
-            for effect in {r.run.effect for r in self.results}
-            for scene in self.scenes
-            if (category(effect) == kind or (kind == MEAN and effect != CLEAN))
-            and any(r.run.effect == effect and r.run.scene == scene for r in self.results)
-        ]
-        means, diverged = [], 0
-        for effect, scene in sorted(pairs):
-            chosen = self.select(effect, scene, method, densification)
-            diverged += sum(r.status == "diverged" for r in chosen)
-            values = finite(r.metrics.get(metric) for r in chosen if r.status == "finished")
-            if values:
-                means.append(sum(values) / len(values))
+        pairs = sorted({(r.run.effect, r.run.scene) for r in self.results if belongs(r.run.effect, kind)})
+        cells = [self.select(*pair, method, densification) for pair in pairs]
+        means = finite(mean(chosen, metric) for chosen in cells)
+        diverged = sum(r.status == "diverged" for chosen in cells for r in chosen)
         if not means and not diverged:
             return None
-        mean = sum(means) / len(means) if means else float("nan")
-        return Value(mean, len(means), len(pairs), diverged)
+        return Value(statistics.mean(means) if means else float("nan"), len(means), len(pairs), diverged)
 
 
 def studies(results: list[Result]) -> list[Study]:
@@ -108,11 +120,8 @@ def studies(results: list[Result]) -> list[Study]:
     keys |= {(r.run.steps, 0) for r in usable}
     found = []
     for steps, seed in keys:
-        chosen = [
-            r
-            for r in usable
-            if r.run.steps == steps and (r.run.effect_seed == seed or r.run.effect == CLEAN or r.run.real)
-        ]
+        alike = [r for r in usable if r.run.steps == steps]
+        chosen = [r for r in alike if r.run.effect_seed == seed or r.run.effect == CLEAN or r.run.real]
         if seed == 0 or any(r.run.effect != CLEAN for r in chosen):
             found.append(Study(steps, seed, chosen))
     return sorted(found, key=lambda study: (-len(study.results), study.steps, study.effect_seed))
@@ -121,6 +130,22 @@ def studies(results: list[Result]) -> list[Study]:
 def finite(values: Iterable[float | None]) -> list[float]:
     """The values that are numbers; JSON's null stands for infinity."""
     return [value for value in values if value is not None]
+
+
+def finished_values(results: Iterable[Result], metric: str) -> list[float]:
+    """A metric of the runs that finished, where it is a number."""
+    return finite(r.metrics.get(metric) for r in results if r.status == "finished")
+
+
+def mean(results: Sequence[Result], metric: str) -> float | None:
+    """Mean of `finished_values`; None where there are none."""
+    values = finished_values(results, metric)
+    return statistics.mean(values) if values else None
+
+
+def belongs(effect: str, kind: str) -> bool:
+    """Whether an effect is of a category, of which `mean` holds all but clean photos."""
+    return category(effect) == kind or (kind == MEAN and effect != CLEAN)
 
 
 def _position(name: str) -> int:

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
-from ssa_nerfstudio.experiments.benchmark.report.study import MEAN, Value
+from ssa_nerfstudio.experiments.benchmark.report.study import MEAN, Study, Value
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN
 
-HEADINGS = {
-    "psnr": "PSNR ↑",
-    "ssim": "SSIM ↑",
-    "flip": "FLIP ↓",
-    "mean_color_deviation": "color deviation ↓",
-}
+HEADINGS = {"psnr": "PSNR ↑", "ssim": "SSIM ↑", "flip": "FLIP ↓", "mean_color_deviation": "color deviation ↓"}
 FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}", "mean_color_deviation": "{:.2f}"}
-ROW_NAMES = {CLEAN: "Clean (Ref)", MEAN: "Mean", "ui": "UI elements", "rain": "Rain spots"}
+_ROW_NAMES = {CLEAN: "Clean (Ref)", MEAN: "Mean", "ui": "UI elements", "rain": "Rain spots"}
 NOTE = "† a run diverged and is left out; (n/m): n of m scenes are there. Best of a row and metric in bold."
+
+
+def row_name(kind: str) -> str:
+    """How tables call a category of artifacts."""
+    return _ROW_NAMES.get(kind, kind.capitalize())
+
+
+def densification_names(study: Study) -> str:
+    """What the cells of a table hold: ADC / MCMC."""
+    return " / ".join(name.upper() for name in study.densifications)
+
+
+def format_cells(study: Study, kind: str, method: str, metrics: Iterable[str]) -> list[str]:
+    """A cell for every metric of one method."""
+    return [
+        format_pair([format_value(study.value(kind, method, d, metric), metric) for d in study.densifications])
+        for metric in metrics
+    ]
 
 
 def format_value(value: Value | None, metric: str, best: str | None = None) -> str:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import shlex
 from pathlib import Path
-from typing import Any
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
@@ -16,18 +15,7 @@ from ssa_nerfstudio.experiments.benchmark.results import Result, absence, read_a
 
 MEASURED = ("step", "seconds", "psnr", "ssim", "flip", "gaussians")
 """What a run notes at every mark."""
-COLUMNS: tuple[str, ...] = (
-    "scene",
-    "effect",
-    "setting",
-    *MEASURED,
-    "on_frontier",
-    "knee",
-    "alone",
-    "device",
-    "run",
-    "command",
-)
+COLUMNS = ("scene", "effect", "setting", *MEASURED, "on_frontier", "knee", "alone", "device", "run", "command")
 """Of the CSV: a line for every point."""
 
 
@@ -89,10 +77,9 @@ def _subjects(results: list[Result]) -> list[Subject]:
 
 def _order(curve: Curve) -> tuple:
     """Few knobs before many, numbers by size."""
-    values = [
-        (0, v, "") if isinstance(v, (int, float)) else (1, 0, str(v)) for v in curve.result.run.variation.values()
-    ]
-    return len(curve.knobs), curve.knobs, values, curve.result.run.seed
+    run = curve.result.run
+    values = [(0, v, "") if isinstance(v, (int, float)) else (1, 0, str(v)) for v in run.variation.values()]
+    return len(curve.knobs), curve.knobs, values, run.seed
 
 
 def _section(subject: Subject, figure: Path) -> Section:
@@ -141,17 +128,8 @@ def _knob_table(subject: Subject) -> Table:
             comparable = curve.result.alone and base is not None and base.result.alone
             difference = [f"{gain:+.2f}", *([f"{more:+.1f}", rate] if comparable else ["", ""])]
         rows.append([curve.setting, *cells, f"{end['gaussians']:,.0f}", *difference])
-    headings = [
-        "Setting",
-        "PSNR ↑",
-        "SSIM ↑",
-        "FLIP ↓",
-        "seconds",
-        "Gaussians",
-        "dB vs base",
-        "s vs base",
-        "s for 1 dB",
-    ]
+    compared = ["dB vs base", "s vs base", "s for 1 dB"]
+    headings = ["Setting", "PSNR ↑", "SSIM ↑", "FLIP ↓", "seconds", "Gaussians", *compared]
     note = (
         "At the end of each run. s for 1 dB: what is paid, or saved, for each; - where one setting is better in both."
     )
@@ -170,29 +148,17 @@ def _frontier_table(subject: Subject, front: list[Point], bend: Point | None) ->
 
 def _write_csv(subjects: list[Subject], path: Path) -> Path:
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(COLUMNS))
-        writer.writeheader()
+        writer = csv.writer(file)
+        writer.writerow(COLUMNS)
         for subject in subjects:
             front = subject.front()
             bend = knee(front)
             for curve in subject.curves:
+                result = curve.result
                 for entry in curve.points:
-                    point = Point(entry["seconds"], entry["psnr"]) if curve.result.alone else None
-                    values: dict[str, Any] = {
-                        name: entry[name] for name in ("step", "seconds", "psnr", "ssim", "flip", "gaussians")
-                    }
-                    writer.writerow(
-                        {
-                            **values,
-                            "scene": subject.scene,
-                            "effect": subject.effect,
-                            "setting": curve.setting,
-                            "on_frontier": int(point in front),
-                            "knee": int(point is not None and point == bend),
-                            "alone": int(curve.result.alone),
-                            "device": subject.device,
-                            "run": curve.result.run.id,
-                            "command": curve.result.command,
-                        }
-                    )
+                    point = Point(entry["seconds"], entry["psnr"]) if result.alone else None
+                    marks = int(point in front), int(point is not None and point == bend), int(result.alone)
+                    origin = subject.device, result.run.id, result.command
+                    measured = (entry[name] for name in MEASURED)
+                    writer.writerow((subject.scene, subject.effect, curve.setting, *measured, *marks, *origin))
     return path
