@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -76,10 +75,11 @@ class Result:
 def write(result: Result, path: Path) -> None:
     """Writes a result; the file appears when it is complete."""
     values = {"format": FORMAT, "version": VERSION, **dataclasses.asdict(result)}
+    # JSON has no infinity: the PSNR of equal pictures becomes null.
+    finite = json.loads(json.dumps(values), parse_constant=lambda name: None)
     path.parent.mkdir(parents=True, exist_ok=True)
     with staged_file(path) as part:
-        # JSON has no infinity: the PSNR of equal pictures becomes null.
-        part.write_text(json.dumps(_finite(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        part.write_text(json.dumps(finite, indent=1) + "\n", encoding="utf-8")
 
 
 def read(path: Path) -> Result:
@@ -89,16 +89,14 @@ def read(path: Path) -> Result:
         InputError: the file cannot be read, is truncated, or is something else.
     """
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_current_names)
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"{path} cannot be read ({error})") from error
     except ValueError as error:
         raise InputError(f"{path} is no whole JSON ({error}): truncated?") from error
     if not isinstance(values, dict) or values.get("format") != FORMAT:
         raise InputError(f"{path} is not a result of ssa bench")
-    if values.get("version") == 1:
-        values = _renamed(values, "mean_colour_deviation", "mean_color_deviation") | {"version": VERSION}
-    if values.get("version") != VERSION:
+    if values.get("version") not in (1, VERSION):
         raise InputError(f"{path} is of version {values.get('version')!r}, this reads version {VERSION}")
     known = {field.name for field in dataclasses.fields(Result)}
     result = build(Result, {name: value for name, value in values.items() if name in known}, str(path))
@@ -186,18 +184,6 @@ def _copy_companions(source: Path, run: str, target: Path, name: str) -> None:
             shutil.copyfile(origin, goal)
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def _renamed(value: Any, old: str, new: str) -> Any:
-    """A copy of JSON in which every key `old` is `new`."""
-    if isinstance(value, dict):
-        return {new if key == old else key: _renamed(item, old, new) for key, item in value.items()}
-    return [_renamed(item, old, new) for item in value] if isinstance(value, list) else value
+def _current_names(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object of JSON with the keys of version 1 as they are spelled now."""
+    return {"mean_color_deviation" if key == "mean_colour_deviation" else key: value for key, value in pairs}

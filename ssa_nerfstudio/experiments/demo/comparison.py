@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.effects.watermark import Watermark
 from ssa_nerfstudio.experiments.runs.machine import versions
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.experiments.runs.training_run import Outcome, train_and_evaluate
+from ssa_nerfstudio.experiments.runs.view_pictures import view_pictures
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
-from ssa_nerfstudio.overlay.rgba import over_checkerboard
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 
 ARTIFACTS = {"dashboard": Dashboard, "watermark": Watermark}
@@ -106,28 +104,17 @@ def compare(
     return Comparison(name, outcomes, _pictures(pipelines), configs, clean_test_views=named)
 
 
-@torch.no_grad()
 def _pictures(pipelines: dict[str, SSAPipeline]) -> dict[str, np.ndarray]:
     """A training photo, a test photo, what each method draws there, and the artifact that was learned."""
-    off, on = pipelines["overlay-off"], pipelines["ssa-splatfacto"]
-    middle = len(on.datamanager.cached_train) // 2
-    camera, batch = on.datamanager.fixed_indices_eval_dataloader[len(on.datamanager.eval_dataset) // 2]
-    for pipeline in (off, on):
-        pipeline.eval()
-    drawn = on.model.get_outputs_for_camera(camera)
+    off, on = view_pictures(pipelines["overlay-off"]), view_pictures(pipelines["ssa-splatfacto"])
     return {
-        "training photo": _image(on.datamanager.cached_train[middle]["image"]),
-        "test photo": _image(batch["image"]),
-        "splats, overlay off": _image(off.model.get_outputs_for_camera(camera)["rgb"]),
-        "splats, ssa-splatfacto": _image(drawn["rgb"]),
-        "artifact learned": _image(over_checkerboard(drawn["overlay_rgb"], drawn["overlay_alpha"])),
-        "matte": _image(drawn["overlay_alpha"].expand_as(drawn["rgb"])),
+        "training photo": on["photo"],
+        "test photo": on["test"],
+        "splats, overlay off": off["render"],
+        "splats, ssa-splatfacto": on["render"],
+        "artifact learned": on["artifact"],
+        "matte": on["matte"],
     }
-
-
-def _image(image: Tensor) -> np.ndarray:
-    values = image.cpu().float() / 255.0 if image.dtype == torch.uint8 else image.cpu().float()
-    return values[..., :3].clamp(0, 1).numpy()
 
 
 def _figures(outcome: Outcome) -> dict[str, Any]:

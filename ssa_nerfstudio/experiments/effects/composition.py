@@ -70,14 +70,8 @@ class Composition:
 
     def whole(self, inside: Layers | None, height: int, width: int) -> Layers:
         """Return the layers of the whole frame: `static`, with `inside` in its box."""
-        base = self.static
-        if base is None:
-            base = Layers(np.ones((height, width, 3), np.float32), np.zeros((height, width, 3), np.float32))
-        if inside is None or self.box is None:
-            return base
-        transmittance, addition = base.transmittance.copy(), base.addition.copy()
-        transmittance[self.box], addition[self.box] = inside.transmittance, inside.addition
-        return Layers(transmittance, addition)
+        base = Layers.clear(height, width) if self.static is None else self.static
+        return base if inside is None or self.box is None else base.pasted(self.box, inside)
 
 
 def _bounding_box(boxes: list[Box]) -> Box:
@@ -91,8 +85,5 @@ def _pasted(layers: Layers, box: Box, frame: Box) -> Layers:
     """Layers of `box` in a rectangle `frame` around it that is clear elsewhere."""
     if box == frame:
         return layers
-    shape = (frame[0].stop - frame[0].start, frame[1].stop - frame[1].start, 3)
-    transmittance, addition = np.ones(shape, np.float32), np.zeros(shape, np.float32)
     rows, columns = (slice(b.start - f.start, b.stop - f.start) for b, f in zip(box, frame, strict=True))
-    transmittance[rows, columns], addition[rows, columns] = layers.transmittance, layers.addition
-    return Layers(transmittance, addition)
+    return Layers.clear(*(side.stop - side.start for side in frame)).pasted((rows, columns), layers)

@@ -54,6 +54,11 @@ class Layers:
         values = np.repeat(transmittance.astype(np.float32)[..., None], 3, axis=2)
         return cls(values, np.zeros_like(values))
 
+    @classmethod
+    def clear(cls, height: int, width: int) -> Layers:
+        """Make the layers of no artifact: T = 1, B = 0."""
+        return cls.dimming(np.ones((height, width)))
+
     @property
     def matte(self) -> np.ndarray:
         """The artifact's matte A = 1 - mean over channels of T, float32 [H, W] in [0, 1]."""
@@ -66,6 +71,12 @@ class Layers:
     def crop(self, box: Box) -> Layers:
         """The layers inside a rectangle."""
         return Layers(self.transmittance[box], self.addition[box])
+
+    def pasted(self, box: Box, inside: Layers) -> Layers:
+        """These layers with those inside a rectangle replaced."""
+        transmittance, addition = self.transmittance.copy(), self.addition.copy()
+        transmittance[box], addition[box] = inside.transmittance, inside.addition
+        return Layers(transmittance, addition)
 
     def apply(self, image: np.ndarray) -> np.ndarray:
         """Put the artifact in front of an image.

@@ -36,13 +36,8 @@ def versions() -> dict[str, str]:
 
 def revision() -> str:
     """The git revision of this code, with `+` where files differ from it; empty outside a checkout."""
-    folder = Path(__file__).parent
-    try:
-        head = _output("git", "-C", str(folder), "rev-parse", "--short=12", "HEAD").strip()
-        changed = _output("git", "-C", str(folder), "status", "--porcelain", "--untracked-files=no").strip()
-    except (OSError, subprocess.SubprocessError):
-        return ""
-    return head + ("+" if changed else "")
+    described = ("describe", "--always", "--exclude=*", "--abbrev=12", "--dirty=+")
+    return _output("git", "-C", str(Path(__file__).parent), *described).strip()
 
 
 def devices() -> list[str]:
@@ -50,10 +45,7 @@ def devices() -> list[str]:
     visible = os.environ.get("CUDA_VISIBLE_DEVICES")
     if visible is not None:
         return [name for name in visible.split(",") if name.strip()]
-    try:
-        lines = _output("nvidia-smi", "--list-gpus").splitlines()
-    except (OSError, subprocess.SubprocessError):
-        return []
+    lines = _output("nvidia-smi", "--list-gpus").splitlines()
     return [str(number) for number, line in enumerate(line for line in lines if line.startswith("GPU "))]
 
 
@@ -84,11 +76,8 @@ class DeviceSharing:
         """Processes on the CUDA device; 0 where it cannot be asked."""
         if self._device is None:
             return 0
-        try:
-            found = _output("nvidia-smi", "-i", self._device, "--query-compute-apps=pid", "--format=csv,noheader")
-        except (OSError, subprocess.SubprocessError):
-            return 0
-        return len(found.split())
+        query = ("-i", self._device, "--query-compute-apps=pid", "--format=csv,noheader")
+        return len(_output("nvidia-smi", *query).split())
 
 
 def _busy() -> float:
@@ -103,4 +92,8 @@ def _own() -> float:
 
 
 def _output(*command: str) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout
+    """What a command prints; nothing where it cannot be run or fails."""
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout
+    except (OSError, subprocess.SubprocessError):
+        return ""

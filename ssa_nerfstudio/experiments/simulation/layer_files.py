@@ -57,19 +57,3 @@ def write_view(path: Path, inside: Layers, box: Box, frame: tuple[int, int]) -> 
     corner = np.array([box[0].start, box[1].start])
     halves = {"T": inside.transmittance.astype(np.float16), "B": inside.addition.astype(np.float16)}
     np.savez(path, corner=corner, frame=np.array(frame), **halves)
-
-
-def read_view(path: Path, static: Layers) -> Layers:
-    """Read one view's layers in the raw frame.
-
-    Args:
-        path: a file of `layers/views/`.
-        static: `layers/raw.npz`, whose values hold outside the rectangle that varies.
-    """
-    with np.load(path) as arrays:
-        row, column = arrays["corner"]
-        transmittance, addition = static.transmittance.copy(), static.addition.copy()
-        height, width, _ = arrays["T"].shape
-        transmittance[row : row + height, column : column + width] = arrays["T"]
-        addition[row : row + height, column : column + width] = arrays["B"]
-    return Layers(transmittance, addition)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import zlib
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,11 +19,7 @@ from ssa_nerfstudio.experiments.effects.layers import VaryingLayers
 
 @dataclass(frozen=True)
 class SceneFile:
-    """A scene as its YAML file states it.
-
-    Raises:
-        ValueError: the seed is negative.
-    """
+    """A scene as its YAML file states it."""
 
     effects: list[Any]
     """From the scene outwards; each a name, a .yaml file, or keys and values: `effect` and that effect's parameters."""
@@ -70,7 +67,8 @@ class Scene:
     def describe(self) -> list[dict[str, Any]]:
         """Return each effect with all its parameters, as a scene file states them."""
         return [
-            {"effect": name} | {key: _plain(value) for key, value in dataclasses.asdict(effect).items()}  # type: ignore[call-overload]
+            # YAML has lists, but no tuples.
+            json.loads(json.dumps({"effect": name, **dataclasses.asdict(effect)}))  # type: ignore[call-overload]
             for name, effect in self.effects
         ]
 
@@ -122,7 +120,3 @@ def _effect(values: Any, where: str) -> tuple[str, Effect]:
         raise InputError(f"{where}: effect {name!r} is unknown", f"choose one of {', '.join(EFFECTS)}")
     parameters = {key: value for key, value in values.items() if key != "effect"}
     return name, build(effect_class(name), parameters, where)
-
-
-def _plain(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value

@@ -23,7 +23,6 @@ from ssa_nerfstudio.data.photos import write_photo
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation import corruption
-from ssa_nerfstudio.experiments.simulation.layer_files import read_view
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
 
@@ -36,6 +35,14 @@ def run(data: Path, output: Path, *arguments: str) -> dict:
 def load(path: Path, suffix: str = "") -> Layers:
     with np.load(path) as arrays:
         return Layers(arrays[f"T{suffix}"], arrays[f"B{suffix}"])
+
+
+def view_layers(path: Path, static: Layers) -> Layers:
+    """The layers of one view in the raw frame: those of its file inside a rectangle, `static` outside."""
+    with np.load(path) as arrays:
+        (row, column), (height, width, _) = arrays["corner"], arrays["T"].shape
+        box = slice(row, row + height), slice(column, column + width)
+        return static.pasted(box, Layers(arrays["T"].astype(np.float32), arrays["B"].astype(np.float32)))
 
 
 def exact(layers: Layers, photo: np.ndarray) -> np.ndarray:
@@ -58,8 +65,8 @@ def test_training_photos_are_the_stored_layers_applied_and_test_photos_are_untou
         clean, corrupted = pixels(data / name.replace("png", "jpg")), pixels(out / name)
         per_view = out / "layers/views" / name.replace("png", "npz")
         assert per_view.exists() == (effect in ("finger", "occlusion"))
-        view_layers = read_view(per_view, layers) if per_view.exists() else layers
-        assert np.abs(corrupted - exact(view_layers, clean)).max() <= 0.5 + 1e-3
+        drawn = view_layers(per_view, layers) if per_view.exists() else layers
+        assert np.abs(corrupted - exact(drawn, clean)).max() <= 0.5 + 1e-3
         assert (corrupted != clean).any()
     pictures = {path.name for path in (out / "layers").glob("*.png")}
     assert pictures == {f"{frame}_{key}.png" for frame in ("raw", "undistorted") for key in "TB"}
@@ -75,7 +82,7 @@ def test_mean_layers_are_the_mean_over_the_training_views(tmp_path):
     out = tmp_path / "out"
     run(write_dataset(tmp_path / "data", width=60, height=44), out, "--effects", "dust", "finger", "occlusion")
     mean = load(out / "layers/raw.npz")
-    views = [read_view(path, mean) for path in sorted((out / "layers/views").rglob("*.npz"))]
+    views = [view_layers(path, mean) for path in sorted((out / "layers/views").rglob("*.npz"))]
     assert len(views) == 8
     for name in ("transmittance", "addition"):
         stack = np.stack([getattr(view, name) for view in views])

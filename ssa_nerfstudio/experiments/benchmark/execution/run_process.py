@@ -126,9 +126,9 @@ def work(request: Request, revision: str) -> Result:
             result.gaussians, result.peak_memory_mb = outcome.gaussians, outcome.peak_memory_mb
             note.stage("pictures")
             result.artifact = _artifact(run, pipeline, place)
-            from ssa_nerfstudio.experiments.benchmark.execution.view_pictures import take
+            from ssa_nerfstudio.experiments.runs.view_pictures import write_view_pictures
 
-            take(pipeline, place.pictures(run.id))
+            write_view_pictures(pipeline, place.pictures(run.id))
             result.status = "finished"
         if request.keep_models:
             shutil.move(place.running(run.id) / "nerfstudio", place.folder / "models" / run.id)
