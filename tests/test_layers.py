@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PRODUCT_SHARE = 0.6
+PRODUCT_SHARE = 0.65
 MAX_LINES = 300
 
 

@@ -79,21 +79,13 @@ def _draw_sheet(demonstration: Demonstration, path: Path) -> None:
 
 
 def _page(demonstration: Demonstration, sheet: Path, results: dict) -> str:
-    comparisons = [
-        {
-            "name": comparison.name,
-            "note": "" if comparison.clean_test_views else CORRUPTED,
-            "rows": _rows(comparison),
-            "config": comparison.configs["ssa-splatfacto"],
-        }
-        for comparison in demonstration.comparisons
-    ]
     return render_page(
         "demo.html",
         "The same photos, without and with the overlay",
         sheet=sheet,
         headings=HEADINGS,
-        comparisons=comparisons,
+        comparisons=[(comparison, _rows(comparison)) for comparison in demonstration.comparisons],
+        corrupted=CORRUPTED,
         command=results["command"],
         made_with=", ".join(f"{name} {value}" for name, value in results["versions"].items()),
     )

@@ -104,15 +104,7 @@ class DemoScene:
         return np.stack([x, y, -np.ones_like(x)], axis=1) @ camera_to_world[:3, :3].T
 
     def trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Follow rays to the first surface that they meet.
-
-        Args:
-            origin: origin of all rays, [3], inside the room and outside the boxes.
-            directions: [N, 3], of any length.
-
-        Returns:
-            Distance in multiples of `directions` [N] and display color [N, 3] in [0, 1], both float32.
-        """
+        """Follow rays from inside the room and outside the boxes; see `ray_casting.trace`."""
         return trace(self._cuboids, origin, directions)
 
     def render(self, camera_to_world: np.ndarray) -> np.ndarray:

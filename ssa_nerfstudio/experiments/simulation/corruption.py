@@ -14,7 +14,7 @@ from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.photos import write_photo
 from ssa_nerfstudio.experiments.effects.composition import Composition
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.simulation.layer_files import LayerFile, write_view
+from ssa_nerfstudio.experiments.simulation.layer_files import add_layers, write_view
 from ssa_nerfstudio.experiments.simulation.scene import Scene
 
 
@@ -35,7 +35,6 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
     # In the output's order, in which nerfstudio numbers cameras.
     cameras = _first_views(sorted((view for _, view in numbered), key=lambda view: Path(names[view.path])))
     (folder / "layers").mkdir()
-    raw, straight = (LayerFile(folder / "layers", frame, len(cameras)) for frame in ("raw", "undistorted"))
 
     for size in dict.fromkeys(view.size for _, view in numbered):
         artifact = scene.draw(*size)
@@ -51,16 +50,23 @@ def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path,
             write_photo(folder / names[view.path], artifact.apply(photo, inside))
             return inside
 
-        mean = _Mean()
-        for inside in ordered_map(work, [item for item in numbered if item[1].size == size], threads):
-            mean.add(inside)
+        views = [item for item in numbered if item[1].size == size]
+        # Added in the views' order: the mean is reproducible.
+        total = np.zeros((2, *(side.stop - side.start for side in artifact.box or ()), 3))
+        for inside in ordered_map(work, views, threads):
+            if inside is not None:
+                total += (inside.transmittance, inside.addition)
             yield
-        layers = artifact.whole(mean.value(), *size)
+        mean = None if artifact.box is None else Layers(*(total / len(views)).astype(np.float32))
+        layers = artifact.whole(mean, *size)
         for camera, view in enumerate(cameras):
             if view.size == size:
-                both = ((raw, layers), (straight, undistorted_layers(layers, view.lens)))
+                both = (("raw", layers), ("undistorted", undistorted_layers(layers, view.lens)))
+                suffix = str(camera) if len(cameras) > 1 else ""
                 # Their compression takes as long as dozens of photos.
-                list(ordered_map(lambda pair, camera=camera: pair[0].add(camera, pair[1]), both, threads))
+                list(
+                    ordered_map(lambda pair, suffix=suffix: add_layers(folder / "layers", suffix, *pair), both, threads)
+                )
 
 
 def undistorted_layers(layers: Layers, lens: Lens) -> Layers:
@@ -75,26 +81,3 @@ def _first_views(views: list[View]) -> list[View]:
     described = np.array([(lens.width, lens.height, lens.fx, lens.fy, lens.cx, lens.cy) for lens in lenses])
     groups = group_frames(described)
     return [views[groups.index(group)] for group in range(max(groups) + 1)]
-
-
-class _Mean:
-    """Mean of the layers of many views, added in a fixed order so that it is reproducible."""
-
-    def __init__(self) -> None:
-        self._sums: tuple[np.ndarray, np.ndarray] | None = None
-        self._count = 0
-
-    def add(self, layers: Layers | None) -> None:
-        if layers is None:
-            return
-        pair = layers.transmittance, layers.addition
-        if self._sums is None:
-            self._sums = np.zeros(pair[0].shape), np.zeros(pair[1].shape)
-        for total, values in zip(self._sums, pair, strict=True):
-            total += values
-        self._count += 1
-
-    def value(self) -> Layers | None:
-        if self._sums is None:
-            return None
-        return Layers(*((total / self._count).astype(np.float32) for total in self._sums))

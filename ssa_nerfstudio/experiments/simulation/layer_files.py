@@ -12,36 +12,25 @@ from PIL import Image
 from ssa_nerfstudio.experiments.effects.layers import Box, Layers
 
 
-class LayerFile:
-    """An .npz file of T and B for every camera of a rig, written one camera after the other.
+def add_layers(folder: Path, suffix: str, name: str, layers: Layers) -> None:
+    """Add one camera's layers to NAME.npz, as `overlay: given` reads them, and PNG pictures of both (B clipped at 1).
 
-    Keys are T and B where there is one camera, else T0, B0, T1, B1, ..., as `overlay: given` reads them.
+    Args:
+        folder: exists.
+        suffix: the camera's number, with which the keys T and B end; empty where there is one camera.
+        name: `raw` or `undistorted`.
+        layers: T and B, float32 [H, W, 3] each.
     """
-
-    def __init__(self, folder: Path, name: str, cameras: int) -> None:
-        """Store where to write.
-
-        Args:
-            folder: exists.
-            name: `raw` or `undistorted`.
-            cameras: number of cameras that will be added.
-        """
-        self._folder, self._name, self._cameras = folder, name, cameras
-
-    def add(self, camera: int, layers: Layers) -> None:
-        """Write one camera's layers, float32 [H, W, 3] each, and PNG pictures of both (B clipped at 1)."""
-        suffix = str(camera) if self._cameras > 1 else ""
-        arrays = {"T": layers.transmittance, "B": layers.addition}
-        # Most layers are constant almost everywhere and compress to a few percent; mud, the densest, to two thirds.
-        path = self._folder / f"{self._name}.npz"
-        with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
-            for key, values in arrays.items():
-                with archive.open(f"{key}{suffix}.npy", "w", force_zip64=True) as file:
-                    np.lib.format.write_array(file, values, allow_pickle=False)
+    arrays = {f"T{suffix}": layers.transmittance, f"B{suffix}": layers.addition}
+    # Most layers are constant almost everywhere and compress to a few percent; mud, the densest, to two thirds.
+    with zipfile.ZipFile(folder / f"{name}.npz", "a", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for key, values in arrays.items():
-            # OpenCV rounds and saturates at once; numpy would hold two more copies of the layer.
-            picture = cv2.convertScaleAbs(values, alpha=255)
-            Image.fromarray(picture).save(self._folder / f"{self._name}_{key}{suffix}.png", compress_level=1)
+            with archive.open(f"{key}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, values, allow_pickle=False)
+    for key, values in arrays.items():
+        # OpenCV rounds and saturates at once; numpy would hold two more copies of the layer.
+        picture = cv2.convertScaleAbs(values, alpha=255)
+        Image.fromarray(picture).save(folder / f"{name}_{key}.png", compress_level=1)
 
 
 def write_view(path: Path, inside: Layers, box: Box, frame: tuple[int, int]) -> None:

@@ -7,6 +7,7 @@ import re
 import zlib
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from string import Template
 
 import numpy as np
 from PIL import Image
@@ -33,7 +34,7 @@ def source(data: str) -> Path:
         InputError: it holds no dataset.
     """
     environment = {"SSA_DATA": "data", **os.environ}
-    path = Path(os.path.expanduser(_expanded(data, environment)))
+    path = Path(Template(data).safe_substitute(environment)).expanduser()
     if data != DEMO and not (path / "transforms.json").is_file():
         variable = re.search(r"\$\{?(\w+)", data)
         hint = f" (set {variable[1]} to the folder of captures)" if variable else ""
@@ -123,9 +124,3 @@ def _reduce(dataset: Dataset, factor: int, output: Path) -> None:
             name = PurePosixPath(view.path).name
             # PNG's bytes under whatever name transforms.json gives: readers go by content.
             small.save(folder / f"images_{factor}" / name, format="PNG")
-
-
-def _expanded(text: str, environment: dict[str, str]) -> str:
-    for name, value in sorted(environment.items(), key=lambda item: -len(item[0])):
-        text = text.replace(f"${{{name}}}", value).replace(f"${name}", value)
-    return text

@@ -197,17 +197,16 @@ class _Progress:
     def __init__(self, path: Path) -> None:
         self._path, self._written = path, 0.0
 
-    def stage(self, name: str) -> None:
-        """A stage begins."""
+    def stage(self, name: str, done: int = 0) -> None:
+        """A stage begins, or that many of its steps are done."""
         with contextlib.suppress(OSError):
-            self._path.write_text(f"{name} 0")
+            self._path.write_text(f"{name} {done}")
 
     def step(self, done: int) -> None:
-        """That many steps are done."""
+        """That many training steps are done."""
         if time.monotonic() - self._written > 0.2:
             self._written = time.monotonic()
-            with contextlib.suppress(OSError):
-                self._path.write_text(f"training {done}")
+            self.stage("training", done)
 
 
 def main(place: ResultsFolder) -> int:

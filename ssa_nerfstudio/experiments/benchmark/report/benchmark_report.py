@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 from collections import Counter
+from itertools import product
 from pathlib import Path
 
 from ssa_nerfstudio.errors import InputError
@@ -124,20 +125,15 @@ def _section(study: Study, with_paper: bool) -> Section:
 def _sheets(study: Study, folders: list[Path], output: Path) -> list[Picture]:
     """A sheet for every scene and artifact: the first seed of every method, ADC where it was run."""
     pictures = []
-    for effect, scene in study.subjects:
-        for densification in study.densifications:
-            columns = []
-            for method in study.methods:
-                chosen = [r for r in study.select(effect, scene, method, densification) if r.status == "finished"]
-                if chosen:
-                    columns.append((chosen[0], _pictures(chosen[0], folders)))
-            drawn = sheet(columns) if columns else None
-            if drawn is not None:
-                name = f"{scene}-{effect}-{densification}-{study.steps}-e{study.effect_seed}.jpg"
-                (output / "sheets").mkdir(parents=True, exist_ok=True)
-                drawn.save(output / "sheets" / name, quality=88)
-                caption = f"{scene}, {effect}, {densification.upper()}, {study.title}"
-                pictures.append(Picture(output / "sheets" / name, caption))
+    for (effect, scene), densification in product(study.subjects, study.densifications):
+        cells = (study.select(effect, scene, method, densification) for method in study.methods)
+        firsts = [finished[0] for cell in cells if (finished := [r for r in cell if r.status == "finished"])]
+        drawn = sheet([(result, _pictures(result, folders)) for result in firsts])
+        if drawn is not None:
+            path = output / "sheets" / f"{scene}-{effect}-{densification}-{study.steps}-e{study.effect_seed}.jpg"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            drawn.save(path, quality=88)
+            pictures.append(Picture(path, f"{scene}, {effect}, {densification.upper()}, {study.title}"))
     return pictures
 
 

@@ -19,7 +19,7 @@ def sheet(columns: list[tuple[Result, Path]]) -> Image.Image | None:
     """Training and test photo, then for each run its render, the artifact it learned, and its matte.
 
     Args:
-        columns: results with the folders of their pictures; at least one.
+        columns: results with the folders of their pictures.
 
     Returns:
         The sheet; None where no pictures are there.

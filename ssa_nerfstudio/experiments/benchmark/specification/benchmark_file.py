@@ -1,7 +1,11 @@
-"""What a benchmark file states: scenes, the parts of the matrix in their order, and the knobs of a tradeoff."""
+"""What a benchmark file states: scenes, the parts of the matrix in their order, and the knobs of a tradeoff.
+
+All of these raise ValueError where a field is out of its range.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -11,16 +15,11 @@ from ssa_nerfstudio.experiments.configuration import build, locate, read
 Densification = Literal["adc", "mcmc"]
 DEMO = "demo"
 """The `data` of a scene that stands for the built-in one."""
-_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ0123456789_.")
 
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A capture.
-
-    Raises:
-        ValueError: a field is out of its range.
-    """
+    """A capture."""
 
     data: str
     """Folder of a nerfstudio dataset, $SSA_DATA and other environment variables are expanded; `demo`: built in."""
@@ -40,7 +39,7 @@ class SceneEntry:
     def __post_init__(self) -> None:
         if self.downscale < 1 or self.eval_interval < 2:
             raise ValueError(f"{self.title}: downscale must be at least 1 and eval_interval at least 2")
-        if not self.title or not set(self.title) <= _NAME_CHARACTERS:
+        if not re.fullmatch(r"[A-Za-z0-9_.]+", self.title):
             raise ValueError(f"scene name {self.title!r} must consist of letters, digits, _ and dots; state one: name")
 
     @property
@@ -51,11 +50,7 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class Part:
-    """A product of scenes, effects, methods, densifications and seeds; parts are run in their order.
-
-    Raises:
-        ValueError: a field is out of its range.
-    """
+    """A product of scenes, effects, methods, densifications and seeds; parts are run in their order."""
 
     methods: tuple[str, ...]
     """Rows of the matrix (`benchmark.matrix.METHODS`), or candidates of the file."""
@@ -79,11 +74,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """What `ssa tradeoff` varies: one knob at a time around a base, and a few together.
-
-    Raises:
-        ValueError: a field is out of its range.
-    """
+    """What `ssa tradeoff` varies: one knob at a time around a base, and a few together."""
 
     scenes: tuple[str, ...]
     """Names of scenes of the file."""

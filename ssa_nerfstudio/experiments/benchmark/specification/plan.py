@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import json
 from dataclasses import dataclass, field
+from itertools import product
 from typing import Any
 
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark, SceneEntry
@@ -81,19 +82,18 @@ def plan(benchmark: Benchmark) -> list[Run]:
     """
     runs: dict[str, Run] = {}
     for part in benchmark.parts:
-        for densification in part.densification:
-            for seed in part.seeds:
-                for name in part.scenes or [scene.title for scene in benchmark.scenes]:
-                    scene = benchmark.scene(name)
-                    for effect in part.effects if scene.artifact is None else (scene.artifact,):
-                        for method in part.methods:
-                            if method == "given" and (scene.artifact is not None or effect == CLEAN):
-                                continue
-                            run = _run(benchmark, scene, effect, method, densification, part.steps)
-                            # Nothing decides where nothing is drawn.
-                            drawn = 0 if effect == CLEAN or run.real else part.effect_seed
-                            run = dataclasses.replace(run, seed=seed, effect_seed=drawn)
-                            runs.setdefault(run.id, run)
+        names = part.scenes or [scene.title for scene in benchmark.scenes]
+        for densification, seed, name in product(part.densification, part.seeds, names):
+            scene = benchmark.scene(name)
+            effects = part.effects if scene.artifact is None else (scene.artifact,)
+            for effect, method in product(effects, part.methods):
+                if method == "given" and (scene.artifact is not None or effect == CLEAN):
+                    continue
+                run = _run(benchmark, scene, effect, method, densification, part.steps)
+                # Nothing decides where nothing is drawn.
+                drawn = 0 if effect == CLEAN or run.real else part.effect_seed
+                run = dataclasses.replace(run, seed=seed, effect_seed=drawn)
+                runs.setdefault(run.id, run)
     return list(runs.values())
 
 
