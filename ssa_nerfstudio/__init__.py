@@ -4,8 +4,8 @@ The public interface; everything else may change between versions. Importing the
 imported when the name is first used.
 
 - `detect(data)`: test whether photos carry a static artifact; one `Detection` per camera.
-- `load_overlay(config)`: the overlay of a run, a `torch.nn.Module` with `layers()`: an `Overlay`, or the oracle overlay of
-  a run that was given one.
+- `load_overlay(config)`: the overlay of a run, a `torch.nn.Module` with `layers()`: an `Overlay`, or the oracle
+  overlay of a run that was given one.
 - `Overlay`: the learnable RGBA overlay that all views of a camera share.
 - `composite(clean, transmittance, addition)`: the image formation model I = T C + B, differentiable.
 - `SSAError`, `InputError`, `TrainingError`: all exceptions that the library raises on purpose.

@@ -41,8 +41,8 @@ def ssim(render: Tensor, target: Tensor) -> float:
     """Structural similarity with an 11 x 11 Gaussian window of sigma 1.5 and "valid" padding.
 
     Only windows inside the image count, so the outer 5 pixels are never a window's center. torchmetrics, and with it
-    splatfacto's `ns-eval`, pads by reflection; its values differ slightly. Mean over channels and windows. Wang et al. 2004,
-    "Image quality assessment: from error visibility to structural similarity", with K1 = 0.01 and K2 = 0.03.
+    splatfacto's `ns-eval`, pads by reflection; its values differ slightly. Mean over channels and windows. Wang et al.
+    2004, "Image quality assessment: from error visibility to structural similarity", with K1 = 0.01 and K2 = 0.03.
 
     Args:
         render: image [H, W, 3], floating point, in [0, 1], both sides at least 11 pixels.

@@ -21,7 +21,7 @@ raise it in proportion, up to `MAX_OVERLAY_FACTOR`."""
 MAX_OVERLAY_FACTOR = 4.0
 """Upper bound of that factor."""
 
-_MODEL_STEPS = (
+MODEL_STEPS = (
     "warmup_length",
     "resolution_schedule",
     "sh_degree_interval",
@@ -30,6 +30,7 @@ _MODEL_STEPS = (
     "mcmc_stop_at",
     "scene_head_start",
 )
+"""Settings of the model that count steps and are scaled; 0 switches one off."""
 
 
 def scaled(config: Config) -> Config:
@@ -42,7 +43,7 @@ def scaled(config: Config) -> Config:
     config = copy.deepcopy(config)
     factor = config.max_num_iterations / FULL_LENGTH
     model: Any = config.pipeline.model
-    for name in _MODEL_STEPS:
+    for name in MODEL_STEPS:
         steps = getattr(model, name)
         setattr(model, name, max(1, round(steps * factor)) if steps else 0)  # 0 switches a schedule off
     model.refine_every = max(MIN_REFINE_EVERY, round(model.refine_every * factor))

@@ -31,16 +31,6 @@ if TYPE_CHECKING:
 
 OVERLAY_SETTINGS = ("overlay", "sparsity", "ignore_background")
 """Settings of the model whose names begin so are the overlay's."""
-_SCHEDULED = (
-    "warmup_length",
-    "refine_every",
-    "reset_alpha_every",
-    "resolution_schedule",
-    "sh_degree_interval",
-    "stop_screen_size_at",
-    "stop_split_at",
-    "mcmc_stop_at",
-)
 
 
 @dataclass(frozen=True)
@@ -168,10 +158,11 @@ def _configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:
 
 def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
     """The schedules that a run really follows, in steps, and the overlay's learning rate."""
-    from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH, scaled
+    from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH, MODEL_STEPS, scaled
 
     final = scaled(config) if config.scale_schedules else config
-    values = {name: getattr(final.pipeline.model, name) for name in _SCHEDULED}
+    names = (*MODEL_STEPS, "refine_every", "reset_alpha_every")
+    values = {name: getattr(final.pipeline.model, name) for name in names}
     for name, entry in final.optimizers.items():
         if entry["scheduler"] is not None:
             values[f"learning_rate_{name}"] = entry["scheduler"].max_steps
