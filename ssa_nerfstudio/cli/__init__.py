@@ -13,12 +13,12 @@ from ssa_nerfstudio.errors import InputError, SSAError
 
 COMMANDS = {
     "bench": "Train and score a matrix of scenes, artifacts, methods and seeds; resumable.",
-    "demo": "Build a small scene, put artifacts in front of it, train without and with the overlay, and report.",
-    "detect": "Say whether photos have a static artifact in front of the scene, and where.",
-    "process": "Make a nerfstudio dataset from photos or videos, with poses that a static artifact does not mislead.",
+    "demo": "Build a small scene, add artifacts to its photos, train without and with the overlay, and report.",
+    "detect": "Say whether photos have a static screen-space artifact, and where.",
+    "process": "Make a nerfstudio dataset from photos or videos, with poses robust to a static artifact.",
     "report": "Tables and pictures from the results of ssa bench.",
-    "simulate": "Put an artifact in front of the training photos of a nerfstudio dataset.",
-    "export-overlay": "Write the artifact that a run learned as pictures and masks, and take it off photos.",
+    "simulate": "Add an artifact to the training photos of a nerfstudio dataset.",
+    "export-overlay": "Write the artifact that a run learned as pictures and masks, and remove it from photos.",
     "export-splats": "Write a run's clean splats as PLY, as ns-export gaussian-splat does, and compressed.",
     "tradeoff": "What accuracy costs in time: one knob at a time and a few together, with frontier and knee.",
 }
@@ -94,4 +94,4 @@ def _run(name: str, options: list[str]) -> None:
 def _usage() -> str:
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {text}" for name, text in COMMANDS.items()]
-    return "\n".join(["usage: ssa COMMAND [options]", "", *lines, "", "ssa COMMAND --help tells a command's options."])
+    return "\n".join(["usage: ssa COMMAND [options]", "", *lines, "", "ssa COMMAND --help lists a command's options."])

@@ -40,8 +40,10 @@ def read(command: type[T], arguments: list[str], program: str, description: str)
 def _one_line(report: str) -> str:
     """What is wrong, without title, borders (drawn where standard output is UTF-8), footer and options' help texts."""
     title, *sections = re.split(r"^(?:[╭╰].*|│? *[─-]{8,}.*)$", report, flags=re.MULTILINE)
-    told = []
+    messages = []
     for section in sections or [title]:
         lines = [re.sub(r"^│ ?|│$|\[/?bold\]", "", line.rstrip()) for line in section.splitlines()]
-        told.append(" ".join(" ".join(line for line in lines if not line.startswith(" " * 8)).split()))
-    return "; ".join(text for text in told if text and not text.startswith(("For full helptext", "Argument helptext")))
+        messages.append(" ".join(" ".join(line for line in lines if not line.startswith(" " * 8)).split()))
+    return "; ".join(
+        text for text in messages if text and not text.startswith(("For full helptext", "Argument helptext"))
+    )

@@ -38,7 +38,7 @@ class Command:
     prepare_only: bool = False
     """Make the datasets and drawn effects, and stop: for machines that cannot draw them."""
     merge: tuple[Path, ...] = ()
-    """Take over the results of these folders first."""
+    """Copy the results of these folders first."""
     keep_models: bool = False
     """Keep config.yml and checkpoint of every training in models/, for ns-viewer and ns-export."""
     list: bool = False
@@ -58,12 +58,10 @@ class Command:
         benchmark = read_benchmark(self.benchmark)
         runs = plan(benchmark)
         if not runs:
-            raise InputError(
-                f"{self.benchmark} states no parts", f"`ssa tradeoff {self.benchmark}` may be what you want"
-            )
+            raise InputError(f"{self.benchmark} states no parts", f"`ssa tradeoff {self.benchmark}` may be meant")
         left = update(self, "bench", benchmark, runs)
         if left == 0 and not (self.prepare_only or self.list):
-            print(f"All {self.benchmark} runs that were asked for are done: ssa report {self.output}")
+            print(f"All {self.benchmark} requested runs are done: ssa report {self.output}")
 
 
 def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]) -> int:

@@ -20,7 +20,7 @@ class Command:
     data: Path | None = None
     """A nerfstudio dataset to show instead of the built-in scene; trained as it is, no artifact is added."""
     steps: int = 800
-    """Training steps of each run; schedules are scaled to it. A capture of megapixels wants thousands and a GPU."""
+    """Training steps of each run; schedules are scaled to it. Photos of megapixels need thousands and a GPU."""
     scale_factor: float = 1.0
     """Photos of --data are resized by this, in (0, 1]."""
 

@@ -11,7 +11,7 @@ from ssa_nerfstudio.errors import InputError
 
 @dataclass
 class Command:
-    """Say whether photos have a static artifact in front of the scene, and where; poses are not needed."""
+    """Say whether photos have a static screen-space artifact, and where; poses are not needed."""
 
     data: Path
     """A nerfstudio dataset (its training photos), a folder of photos or videos, or one video."""

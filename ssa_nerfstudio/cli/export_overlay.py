@@ -28,7 +28,7 @@ class Command:
     """Folder of photos, original or undistorted, at any resolution: written without the artifact to OUTPUT/photos,
     black where the matte is above 0.95."""
     camera: int | None = None
-    """For --apply with a rig: the camera whose photos these are, counted from 0 as in overlay.json."""
+    """For --apply with a rig: the camera of these photos, counted from 0 as in overlay.json."""
 
     def run(self) -> None:
         """Read the checkpoint, write, and print what could not be recovered.
@@ -59,7 +59,8 @@ class Command:
             if len(raw) > 1:
                 if self.camera is None or not 0 <= self.camera < len(raw):
                     raise InputError(
-                        f"the run has {len(raw)} cameras", f"say whose photos these are: --camera 0 to {len(raw) - 1}"
+                        f"the run has {len(raw)} cameras",
+                        f"choose the camera of these photos: --camera 0 to {len(raw) - 1}",
                     )
                 frames = [raw[self.camera], undistorted[self.camera]]
         console = Console(highlight=False, soft_wrap=True)

@@ -19,7 +19,7 @@ class Command:
     """Folder of the report; `report` in the first folder where not given."""
 
     def run(self) -> None:
-        """Write the report and say what was ignored.
+        """Write the report and print what was ignored.
 
         Raises:
             InputError: there are no results.

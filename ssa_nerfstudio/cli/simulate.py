@@ -12,7 +12,7 @@ from ssa_nerfstudio.errors import InputError
 
 @dataclass
 class Command:
-    """Put an artifact in front of the training photos of a nerfstudio dataset; test photos stay clean."""
+    """Add an artifact to the training photos of a nerfstudio dataset; test photos stay clean."""
 
     data: Path
     """Dataset to read: the folder with transforms.json, or the .json file."""
@@ -45,7 +45,7 @@ class Command:
         from ssa_nerfstudio.experiments.simulation.simulator import simulate
 
         if (self.effects is None) == (self.scene is None):
-            raise InputError("say what to simulate: either --effects NAME ... or --scene NAME")
+            raise InputError("give either --effects NAME ... or --scene NAME")
         for name, lowest in (("seed", 0), ("threads", 1), ("eval_interval", 2), ("downscale_factor", 1)):
             if (value := getattr(self, name)) is not None and value < lowest:
                 raise InputError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")

@@ -100,9 +100,9 @@ class Dataset:
     def split(self) -> tuple[list[str], list[str], list[str]]:
         """Paths of training, validation and test views.
 
-        As transforms.json has them, what is missing there completed: validation and test stand for one another, and
-        the remaining views are training views. Where it has none, nerfstudio's interval split: in sorted order the
-        views 0, n, 2n, ... are for both validation and test, the others for training.
+        As transforms.json has them, what is missing there completed: validation views serve as test views and vice
+        versa, and the remaining views are training views. Where it has none, nerfstudio's interval split: in sorted
+        order the views 0, n, 2n, ... are for both validation and test, the others for training.
         """
         paths = sorted((frame["file_path"] for frame in self.transforms.frames), key=Path)
         if self.split_by_interval:
@@ -125,7 +125,7 @@ class Dataset:
     def points(self) -> list[str]:
         """Files of the sparse points, relative to `root`.
 
-        Where an older dataset lacks the .ply or the transform that was applied, nerfstudio looks at COLMAP's model.
+        Where an older dataset lacks the .ply or the transform that was applied, nerfstudio reads COLMAP's model.
         """
         stated = [self.meta["ply_file_path"]] if "ply_file_path" in self.meta else []
         if stated and "applied_transform" in self.meta:

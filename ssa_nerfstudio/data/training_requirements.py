@@ -76,7 +76,7 @@ def _check_alignment(transforms: Transforms) -> None:
         raise InputError(f"{path}: applied_scale is no finite number", "correct or remove it")
     if meta.get("orientation_override", "none") not in _ORIENTATION_METHODS:
         names = ", ".join(_ORIENTATION_METHODS)
-        raise InputError(f"{path}: orientation_override is none of {names}", "correct or remove it")
+        raise InputError(f"{path}: orientation_override must be one of {names}", "correct or remove it")
     if not isinstance(meta.get("ply_file_path", ""), str):
         raise InputError(f"{path}: ply_file_path is no file path", "correct or remove it")
 
@@ -117,7 +117,7 @@ def _in_a_smaller_size(photo: Path) -> bool:
     """Whether a reduced copy lies beside the photo's folder, as in images_4."""
     try:
         return any(is_file(folder / photo.name) for folder in photo.parent.parent.glob(f"{photo.parent.name}_*"))
-    except (OSError, ValueError, NotImplementedError):  # the name of a folder that can be none
+    except (OSError, ValueError, NotImplementedError):  # no folder can have that name
         return False
 
 

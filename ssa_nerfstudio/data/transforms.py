@@ -139,7 +139,7 @@ class Transforms:
         """
         i, n = self.intrinsics(frame), downscale_factor
         if any(i.distortion) and self.camera_model not in PERSPECTIVE_MODELS | FISHEYE_MODELS:
-            raise ValueError(f"camera_model {self.camera_model} with distortion is none that splatfacto trains on")
+            raise ValueError(f"camera_model {self.camera_model} with distortion cannot be used by splatfacto")
         distortion = i.distortion if any(i.distortion) else (0.0,) * 6
         model = "fisheye" if self.camera_model in FISHEYE_MODELS else "perspective"
         return Lens(int(i.width / n), int(i.height / n), i.fx / n, i.fy / n, i.cx / n, i.cy / n, distortion, model)
@@ -207,9 +207,7 @@ class Transforms:
             seen.add(photo)
         for name in [*(frame[key] for frame in self.frames for key in FILE_KEYS if key in frame), *others]:
             if not isinstance(name, str):
-                raise InputError(
-                    f"{self.path}: {name!r} stands where a file's path is expected", "correct or remove it"
-                )
+                raise InputError(f"{self.path}: {name!r} is no file path", "correct or remove it")
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
                 raise InputError(
                     f"{self.path}: {name} lies outside the dataset", "put it inside and state its relative path"
@@ -222,7 +220,7 @@ class Transforms:
             raise InputError(problem, "write it again with ns-process-data")
         for frame in frames:
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-                raise InputError(f"{problem}: the frame {frame!r:.100} is none", "correct or remove it")
+                raise InputError(f"{problem}: the frame {frame!r:.100} is no such object", "correct or remove it")
 
     def _check_cameras(self) -> None:
         known = PERSPECTIVE_MODELS | FISHEYE_MODELS | OTHER_MODELS
@@ -241,7 +239,7 @@ class Transforms:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; False where the name can be none."""
+    """Whether there is such a file; False where no file can have that name."""
     try:
         return path.is_file()
     except OSError:  # a name that is too long

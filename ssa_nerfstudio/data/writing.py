@@ -58,7 +58,7 @@ def staged_file(path: Path) -> Iterator[Path]:
 
     One process at a time may write a file: two would share the temporary name. It is always the same, so that what a
     killed process leaves behind is overwritten by the next attempt. It ends in `.part`, so libraries that choose a
-    format by suffix have to be told.
+    format by the suffix need the format as an argument.
 
     Args:
         path: the file to write; its folder exists.

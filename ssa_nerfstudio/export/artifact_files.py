@@ -25,7 +25,7 @@ FILES = {
     "mask_white_is_scene.png": "8 bits, 0 where the matte exceeds the threshold, else 255: for nerfstudio (mask_path) "
     "and COLMAP (ImageReader.camera_mask_path), which both ignore black",
     "mask_white_is_artifact.png": "the same mask inverted, for inpainting and editing tools",
-    "preview.png": "the artifact over a checkerboard, to look at",
+    "preview.png": "the artifact over a checkerboard, as a preview",
 }
 """Files that `write_overlay` writes for each camera, and what they hold."""
 LAYERS_FILE = "layers.npz"

@@ -126,7 +126,7 @@ class ScreenSpaceOverlay(nn.Module):
 
         Args:
             clean: C [H // reduction, W // reduction, 3], the render with its background.
-            reduction: 1, 2 or 4: factor by which training images are reduced.
+            reduction: 1, 2, 4 or 8: factor by which training images are reduced.
             behind: opacity of the splats [H // reduction, W // reduction, 1] and color of the background [3], for the
                 matte's gradient of `composite_over_splats`; None for plain compositing.
 
@@ -142,7 +142,7 @@ class ScreenSpaceOverlay(nn.Module):
         """Resample the overlay to training images, averaged premultiplied.
 
         Args:
-            reduction: 1, 2 or 4: factor by which training images are reduced.
+            reduction: 1, 2, 4 or 8: factor by which training images are reduced.
 
         Returns:
             Transmittance T [H // reduction, W // reduction, 1] and addition B [H // reduction, W // reduction, 3].

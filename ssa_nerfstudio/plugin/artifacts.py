@@ -121,7 +121,7 @@ class Artifacts(nn.Module):
         Args:
             state: the model's state dict; entries that older versions lack are added.
             prefix: of this module's entries in it.
-            wanted: False where the run was asked to train without an overlay.
+            wanted: False where the run is to train without an overlay.
 
         Raises:
             InputError: the checkpoint's overlays do not fit this run.
@@ -166,7 +166,7 @@ class Artifacts(nn.Module):
             setting: this run's overlay: auto, on or given.
 
         Raises:
-            InputError: the checkpoint knows no camera like one of this run's, or was trained with another setting.
+            InputError: the checkpoint has no camera of one of this run's sizes, or was trained with another setting.
         """
         self.allocate(state, prefix, wanted=True)
         here = "given" if len(self) and isinstance(self[0], OracleOverlay) else "on" if len(self) else "off"
@@ -184,7 +184,7 @@ class Artifacts(nn.Module):
                 raise InputError(
                     f"the checkpoint was trained on frames (width, height) of {there}, this run has "
                     f"{tuple(key[:2].int().tolist())}",
-                    "resume with the photos and camera-res-scale-factor of then",
+                    "resume with the photos and camera-res-scale-factor it was trained with",
                 )
             places.append(place if place < len(self) else None)
         self._group_of_view = [places[group] for group in groups]

@@ -66,7 +66,7 @@ def lens(described: list[float]) -> Lens:
     """The lens of one row of `describe_lenses`.
 
     Raises:
-        ValueError: nerfstudio knows no distortion for such a camera.
+        ValueError: the camera's type is neither perspective nor fisheye, and it has distortion.
     """
     width, height, fx, fy, cx, cy, *distortion, kind = described
     if kind == CameraType.FISHEYE.value:

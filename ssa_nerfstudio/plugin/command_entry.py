@@ -1,4 +1,4 @@
-"""Where nerfstudio's commands meet our exceptions: one line and an exit code instead of a traceback."""
+"""One line and an exit code, instead of a traceback, where one of our exceptions ends a nerfstudio command."""
 
 from __future__ import annotations
 

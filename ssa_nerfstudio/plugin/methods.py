@@ -69,7 +69,7 @@ def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:
 
 ssa_splatfacto = MethodSpecification(
     config=_trainer("ssa-splatfacto", SSASplatfactoModelConfig()),
-    description="splatfacto that removes what every photo has in front of the scene (watermark, dashboard, mud, rain).",
+    description="splatfacto that learns and removes a static screen-space artifact (watermark, dashboard, mud, rain).",
 )
 
 ssa_splatfacto_mcmc = MethodSpecification(

@@ -124,7 +124,7 @@ class SSATrainer(Trainer):
                 return
             _LOG.warning(f"{candidate} cannot be used ({error})")
         raise InputError(
-            f"{folder} holds no checkpoint that can be read", "give the folder of another run, or train anew"
+            f"{folder} holds no checkpoint that can be read", "give the folder of another run, or start a new training"
         )
 
     def _load_one(self) -> str | None:
@@ -157,7 +157,7 @@ class SSATrainer(Trainer):
                 super().save_checkpoint(step)
         except (OSError, RuntimeError) as error:
             earlier = newest_first(folder)
-            remedy = f"resume from {earlier[0]}: --load-dir {folder}" if earlier else "train anew"
+            remedy = f"resume from {earlier[0]}: --load-dir {folder}" if earlier else "start a new training"
             raise TrainingError(
                 f"the checkpoint of step {step} could not be written to {folder} ({str(error).splitlines()[0]})",
                 f"make room on the disk and {remedy}",

@@ -1,4 +1,7 @@
-"""Checks of a training's inputs before anything is built; transforms.json is checked in `data`."""
+"""Checks of a training's settings and views; transforms.json is checked in `data`.
+
+`check_views` needs the datamanager, the others run before anything is built.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +22,7 @@ def check_device(device: torch.device | str) -> None:
     """Refuse CUDA where there is none."""
     if torch.device(device).type == "cuda" and not torch.cuda.is_available():
         raise InputError(
-            "CUDA was asked for and this machine has none that torch can use",
+            "the device is cuda, and torch finds no CUDA on this machine",
             "add --machine.device-type cpu, or install a torch build for your driver",
         )
 

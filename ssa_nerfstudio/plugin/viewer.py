@@ -1,7 +1,7 @@
 """Controls of the overlay in nerfstudio's viewer: a checkbox, a choice of layers, a summary, a button that saves.
 
 The viewer finds elements by walking every public attribute of the model and sorts them by the attributes' names, hence
-the letters in front of the names. Without a viewer elements have their default value, and the overlay is off.
+the letters that start the names. Without a viewer elements have their default value, and the overlay is off.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class _CameraChoice(ViewerDropdown[str]):
     """Chooses the camera group; hidden where there is one."""
 
     def __init__(self, count: Callable[[], int]) -> None:
-        super().__init__("Camera", AUTOMATIC, [AUTOMATIC], hint="Whose artifact of a rig's cameras")
+        super().__init__("Camera", AUTOMATIC, [AUTOMATIC], hint="Which camera's artifact is shown, counted from 0")
         self._count = count
 
     def _create_gui_handle(self, viser_server: viser.ViserServer) -> None:

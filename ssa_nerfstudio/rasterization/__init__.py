@@ -1,4 +1,4 @@
-"""Rasterization of Gaussians: one interface, that of gsplat, and three bodies.
+"""Rasterization of Gaussians: gsplat's interface with three implementations.
 
 `gsplat` runs on CUDA, `cpu` by numba kernels with a hand-written backward pass, `reference` in plain torch on any
 device and in any float dtype. `rasterizer` selects one by name, or by the device that holds the Gaussians.
@@ -17,11 +17,11 @@ RasterizerName = Literal["auto", "gsplat", "cpu", "reference"]
 
 
 def rasterizer(name: RasterizerName, device: torch.device | str) -> Rasterization:
-    """Select the `rasterization` function of one body.
+    """Select the `rasterization` function of one implementation.
 
     Args:
-        name: the body; `auto` is `gsplat` on CUDA and `cpu` elsewhere.
-        device: that holds the Gaussians.
+        name: of the implementation; `auto` is `gsplat` on CUDA and `cpu` elsewhere.
+        device: the device that holds the Gaussians.
 
     Returns:
         A function with the interface of `gsplat.rasterization`, as `interface.make_rasterization` documents it.

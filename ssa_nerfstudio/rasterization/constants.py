@@ -1,4 +1,4 @@
-"""The constants of gsplat 1.4.0's rasterizer, which all bodies share to draw the same image.
+"""The constants of gsplat 1.4.0's rasterizer, which all implementations share to draw the same image.
 
 Source: `gsplat/cuda/csrc/rasterize_to_pixels_fwd.cu` and `gsplat/rendering.py` at version 1.4.0. Pixel centers lie at
 +0.5.

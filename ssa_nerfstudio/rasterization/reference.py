@@ -1,6 +1,6 @@
 """The reference rasterizer: a loop over tiles in plain torch, differentiated by autograd, in any float dtype.
 
-It is slow and defines what the other bodies compute; tests and the rasterizer benchmark compare them with it.
+It is slow and defines what the other implementations compute; tests and the rasterizer benchmark compare them with it.
 """
 
 from __future__ import annotations

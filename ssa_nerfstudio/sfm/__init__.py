@@ -1,1 +1,1 @@
-"""Photos and videos to a nerfstudio dataset, in spite of a static artifact."""
+"""Photos and videos to a nerfstudio dataset, robust to a static artifact."""

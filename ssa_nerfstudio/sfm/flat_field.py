@@ -21,7 +21,7 @@ from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.evidence.poisson import add_divergence, solve_poisson
 
 MIN_PHOTOS = 8
-"""With fewer photos, static structure cannot be told from scene structure at the same place."""
+"""With fewer photos, static structure cannot be distinguished from scene structure at the same place."""
 _MAX_PHOTOS = 64
 _DARK = 8.0
 """Added to 8-bit values before the logarithm: darker differences are noise."""

@@ -2,7 +2,7 @@
 
 COLMAP runs threads of its own. When one of them cannot write, because the disk is full, it throws where nothing can
 catch it, and the whole process is aborted; COLMAP also replaces the process's signal handlers. In a child process
-(`colmap.py`) an abort is an exit code, and the parent can say what went wrong and keep what is worth keeping.
+(`colmap.py`) an abort is an exit code, and the parent can report the problem and keep usable results.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 MODEL = "model"
 """Folder of the chosen model, in COLMAP's binary files; missing where none was found."""
 JOB = "job.json"
-"""File that tells the child what to do."""
+"""File with the child's arguments."""
 
 
 @dataclass(frozen=True)

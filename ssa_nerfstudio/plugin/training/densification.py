@@ -28,7 +28,7 @@ def make_strategy(
 
     Args:
         settings: the model's.
-        defaults: fields of splatfacto's own `DefaultStrategy`, which ADC takes over.
+        defaults: fields of splatfacto's own `DefaultStrategy`, which ADC uses.
         params: of the Gaussians, changed in place under MCMC.
     """
     if settings.strategy == "adc":
@@ -117,7 +117,7 @@ class AdaptiveDensityControl(DefaultStrategy):
 class MarkovChainMonteCarlo(MCMCStrategy):
     """gsplat's MCMCStrategy (Kheradmand et al. 2024): dead Gaussians are relocated to living ones, with a fixed cap.
 
-    The schedule is written anew because of the noise, which is fifteen launches in gsplat and two here.
+    The schedule is repeated here because of the noise, which is fifteen launches in gsplat and two here.
     """
 
     absgrad: bool = False

@@ -15,7 +15,7 @@ _TRITON = importlib.util.find_spec("triton") is not None
 @torch.no_grad()
 def perturb(params: Mapping[str, Tensor], rate: float, scale: Tensor | None = None) -> None:
     """Perturb the centers of Gaussians, transparent ones most: mu += rate sigmoid(100 (0.005 - o)) Sigma eta with eta
-    standard normal (3DGS as MCMC, arXiv 2404.09591, equations 8 and 9).
+    standard normal (3DGS as MCMC, arXiv 2404.09591).
 
     Two launches where Triton's kernels run; elsewhere gsplat's function, fifteen on CUDA.
 

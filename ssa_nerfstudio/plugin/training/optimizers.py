@@ -34,7 +34,7 @@ class JointOptimizers(Optimizers):
         self.guard = guard
         for optimizer in self.optimizers.values():
             if isinstance(optimizer, FusedAdam):
-                # torch's schedulers warn unless `step` was called; `update` stands in for it.
+                # torch's schedulers warn unless `step` was called; `update` replaces it.
                 optimizer._opt_called = True  # pyright: ignore[reportAttributeAccessIssue]
 
     def zero_grad_some(self, param_groups: list[str]) -> None:
@@ -72,7 +72,7 @@ class JointOptimizers(Optimizers):
             for optimizer in fused:
                 optimizer.update(None if verdict is None else verdict.skipped)
         for optimizer in optimizers:
-            # Other optimizers cannot be told on the device: the host waits for the verdict.
+            # Other optimizers cannot skip a step on the device, so the host waits for the verdict.
             if not isinstance(optimizer, FusedAdam) and (verdict is None or verdict.taken.item()):
                 optimizer.step()
 

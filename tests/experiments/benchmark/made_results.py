@@ -15,7 +15,7 @@ GAIN = {"3dgs": -4.0, "default": 0.5, "overlay-on": 0.4, "paper": 0.0, "given": 
 
 
 def benchmark(**changes) -> Benchmark:
-    """Two scenes, two artifacts and clean photos, four methods, two seeds, both densifications."""
+    """Two scenes, two artifacts and clean photos, six methods, two seeds, both densifications."""
     part = Part(
         methods=("3dgs", "default", "paper", "given", "l1-0", "constant-start"),
         effects=("none", "dashboard", "mud"),
