@@ -71,7 +71,7 @@ def measure_edges(statistics: ImageStatistics) -> EdgeEvidence:
         statistics: of all views of one camera, in the order of the capture.
     """
     means, seen = statistics.brightness.means()
-    # Where a block shows nothing of a pixel, the mean of the others stands in.
+    # A block that shows nothing of a pixel gets the mean of the others there.
     average = (means * seen).sum(dim=0) / seen.sum(dim=0).clamp_min(1)
     means = torch.where(seen, means, average).float() / statistics.scale
     hidden = (~seen.any(dim=0)).float()[None, None]

@@ -1,4 +1,4 @@
-"""Compositing: the image that a camera records of a render and the artifact in front of it.
+"""Compositing: the image that a camera records of a scene through an artifact.
 
 Source: the paper, equation "composition". The matte's gradient over splats alone is ours (docs/method.md).
 """
@@ -33,7 +33,7 @@ def composite_over_splats(
 
     Where no splat covers a pixel, the render shows the background color (in splatfacto a random one at every step).
     Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
-    Here the matte's gradient is taken as if the overlay's own color stood behind the splats: hiding background gains
+    Here the matte's gradient is taken as if the overlay's own color were the background: hiding background gains
     nothing, sparsity removes the overlay there, and the scene has to fill the hole.
 
     Args:

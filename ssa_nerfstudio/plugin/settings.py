@@ -37,7 +37,7 @@ class ModelSettings(SplatfactoModelConfig):
     sparsity_weight: float = 0.02
     """Weight of the sparsity term, lambda_sparse, not negative; the paper has 0.05, and 0.01 for mud."""
     ignore_background: bool = True
-    """Take the matte's gradient as if the overlay's color stood behind the splats, so that hiding background that no
+    """Take the matte's gradient as if the overlay's color were the background, so that hiding background that no
     splat covers (a sky without points) is not rewarded; False: plain compositing, as in the paper."""
     strategy: Literal["adc", "mcmc"] = "adc"
     """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""

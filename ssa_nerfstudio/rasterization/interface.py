@@ -1,6 +1,7 @@
 """The interface of all rasterizers here: arguments, checks and results of gsplat's `rasterization`.
 
-A body is a `Render`. `make_rasterization` wraps it in the signature, the argument checks and the `info` dictionary.
+An implementation is a `Render`. `make_rasterization` wraps it in the signature, the argument checks and the `info`
+dictionary.
 """
 
 from __future__ import annotations
@@ -54,13 +55,13 @@ Render = Callable[[Gaussians, Cameras, RenderOptions], tuple[Tensor, Tensor, Ten
 """Returns render [C, H, W, X], alpha [C, H, W, 1], radii [C, N] int32 and means2d [C, N, 2].
 
 Gradients of the projected centers flow through means2d, because densification reads them there; with `absgrad`, the
-body leaves their summed magnitudes in `means2d.absgrad`.
+implementation leaves their summed magnitudes in `means2d.absgrad`.
 """
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
 def make_rasterization(render: Render) -> Rasterization:
-    """Wrap a body in gsplat's interface; its signature, documentation and checks are in this one place."""
+    """Wrap an implementation in gsplat's interface; its signature, documentation and checks are in this one place."""
 
     def rasterization(
         means: Tensor,  # [N, 3]

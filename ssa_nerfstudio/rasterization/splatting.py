@@ -1,4 +1,4 @@
-"""Rendering by projecting each camera's Gaussians and blending them: the frame of the bodies without CUDA."""
+"""Rendering by projecting each camera's Gaussians and blending them: what the implementations without CUDA share."""
 
 from __future__ import annotations
 
