@@ -83,11 +83,11 @@ def _run(name: str, options: list[str]) -> None:
     command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
     try:
         arguments.read(command, options, f"ssa {name}", COMMANDS[name]).run()
-    except ModuleNotFoundError as error:
+    except ImportError as error:  # also of a library that misses an optional package of its own
         if name not in EXPERIMENTS or (error.name or "").startswith("ssa_nerfstudio"):
             raise
         raise InputError(
-            f"ssa {name} needs the package {error.name}", "pip install 'ssa-nerfstudio[experiments]'"
+            f"ssa {name} needs a package that is not installed ({error})", "pip install 'ssa-nerfstudio[experiments]'"
         ) from error
 
 

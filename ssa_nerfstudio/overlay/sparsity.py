@@ -21,7 +21,7 @@ def sparsity_loss(matte: Tensor, evidence: Tensor, kind: Sparsity) -> Tensor:
     """Penalize the matte.
 
     `l1` is the paper's mean_u A(u). `log` is mean_u (0.1 + 0.9 r(u)) log(1 + A / e) / log(1 + 1 / e) with e = 0.1: it
-    presses on a faint, wide matte (an exposure layer), and spares opaque pixels and pixels whose views agree.
+    penalizes a faint, wide matte (an exposure layer) most, and opaque pixels and pixels whose views agree least.
 
     Args:
         matte: A [h, w, 1] in [0, 1].

@@ -16,7 +16,7 @@ def report_in_one_line() -> None:
     nerfstudio's commands have no hook for this, so it is `sys.excepthook`. Scripts that import the plugin keep their
     tracebacks.
     """
-    if not _is_nerfstudio_command():
+    if not is_nerfstudio_command():
         return
     show_warnings()
     former = sys.excepthook
@@ -29,7 +29,7 @@ def report_in_one_line() -> None:
     sys.excepthook = hook
 
 
-def _is_nerfstudio_command() -> bool:
+def is_nerfstudio_command() -> bool:
     """Whether this process is `ns-...` or `python -m nerfstudio.scripts...`."""
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)
     module = "" if spec is None else spec.name

@@ -7,7 +7,7 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
 
-from ssa_nerfstudio.plugin import command_entry
+from ssa_nerfstudio.plugin import command_entry, former_names
 from ssa_nerfstudio.plugin.compat import nerfstudio_repairs, open3d_libraries, versions
 from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
@@ -20,7 +20,9 @@ command_entry.report_in_one_line()
 versions.check_versions()
 open3d_libraries.preload()
 nerfstudio_repairs.allow_checkpoint_scalars()
-nerfstudio_repairs.provide_ffmpeg()
+former_names.provide_former_names()
+if command_entry.is_nerfstudio_command():
+    nerfstudio_repairs.provide_ffmpeg()
 
 
 def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:

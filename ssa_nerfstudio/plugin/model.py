@@ -41,9 +41,9 @@ class SSASplatfactoModelConfig(ModelSettings):
 
 
 class SSASplatfactoModel(SplatfactoModel):
-    """Gaussian splats and, per camera group, the artifact in front of them. `rgb` is the clean render everywhere.
+    """Gaussian splats and one overlay per camera group. `rgb` is the clean render everywhere.
 
-    The artifacts come from the pipeline (`artifacts.assign`), or from a checkpoint, whose shapes they take.
+    The overlays come from the pipeline (`artifacts.assign`) or from a checkpoint.
     """
 
     config: SSASplatfactoModelConfig

@@ -33,7 +33,7 @@ def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np
     try:
         with Image.open(path) as image:
             gray = np.asarray(image.convert("L"))
-    except (OSError, SyntaxError, ValueError) as error:
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise InputError(
             f"{path} cannot be read as a mask ({error})", "give a picture, black where to ignore"
         ) from error

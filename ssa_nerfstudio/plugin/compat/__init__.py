@@ -1,7 +1,7 @@
 """What nerfstudio 1.1.5 and gsplat 1.4.0 need repaired: one function per repair, with its reason and when it may go.
 
 Each has a test in tests/plugin/compat that fails on the day upstream no longer needs the repair. Repairs that are an
-overridden method stand with the class that overrides it:
+overridden method are in the class that overrides it:
 
 - `datamanager`: `cache_images="cpu"` pins memory, which needs CUDA.
 - `model.populate_modules`: seed colors are moved to CUDA (splatfacto.py:261).

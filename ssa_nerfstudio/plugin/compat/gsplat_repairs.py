@@ -13,9 +13,9 @@ from torch import Tensor
 
 @cache
 def enable_mcmc_on_cpu() -> None:
-    """Give gsplat's MCMC strategy torch bodies for its two CUDA kernels, chosen by the tensors' device.
+    """Give gsplat's MCMC strategy torch implementations of its two CUDA kernels, chosen by the tensors' device.
 
-    Called when a model with MCMC is built without CUDA, not at import. May go when gsplat ships CPU bodies
+    Called when an MCMC strategy is made, not at import. May go when gsplat ships CPU bodies
     (https://github.com/nerfstudio-project/gsplat/issues/635).
     """
     ops = gsplat.strategy.ops

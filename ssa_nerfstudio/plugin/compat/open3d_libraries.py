@@ -1,4 +1,4 @@
-"""open3d's wheels link to libusb and do not bring it; slim systems have none, and then nerfstudio cannot read points.
+"""open3d's wheels need libusb without including it; on a slim system nerfstudio then cannot read point clouds.
 
 `preload` serves commands that import the plugin before open3d. `ns-export` imports open3d first, which is why `make
 setup` runs this module: it copies the library beside open3d. May go when open3d's wheels bring it.

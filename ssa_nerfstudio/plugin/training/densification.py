@@ -126,8 +126,7 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     """Relocate Gaussians that are not finite, and revive a scene in which all are dead."""
 
     def __post_init__(self) -> None:
-        if not torch.cuda.is_available():
-            enable_mcmc_on_cpu()
+        enable_mcmc_on_cpu()  # also where there is CUDA: the training may run on the CPU
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of the strategy; the scene's scale plays no part in it."""

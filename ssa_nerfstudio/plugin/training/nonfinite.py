@@ -76,10 +76,10 @@ class NonFiniteGuard:
             self._factors = loss.new_tensor([SQUARE_LIMIT, 1 / SQUARE_LIMIT], dtype=torch.float32).unbind()
             self._taken, self._skipped = rows
             self._verdicts = [Verdict(*pair) for pair in zip(*(row.unbind() for row in rows), strict=True)]
-        self._optimizers, self._loss = optimizers, loss.detach()
+        self._optimizers, self._loss = optimizers, loss.detach().float()
         verdict = self._verdicts[self._judged]
         self._judged += 1
-        # Densification replaces parameters, so the list is made anew.
+        # Densification replaces parameters, so the list is rebuilt at every step.
         values = [self._loss, *(p.grad for _, p in _parameters(optimizers) if p.grad is not None)]
         # One kernel over a list of tensors sets `skipped` where a value is not finite, and multiplies all of them. The
         # second call finds what overflowed in the first, and restores all other values: powers of two round nothing.

@@ -17,8 +17,9 @@ import torch
 from gsplat.cuda import _wrapper
 from gsplat.strategy import DefaultStrategy
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import Trainer
-from nerfstudio.models.splatfacto import SplatfactoModel
+from nerfstudio.models.splatfacto import SplatfactoModel, SplatfactoModelConfig
 from nerfstudio.utils import install_checks
 
 from ssa_nerfstudio.plugin.compat import gsplat_repairs, nerfstudio_repairs, open3d_libraries, versions
@@ -50,12 +51,12 @@ def test_splatfacto_builds_lpips_which_downloads_weights(monkeypatch):
         raise Built
 
     monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", build)
-    source = inspect.getsource(SplatfactoModel.populate_modules)
-    assert "LearnedPerceptualImagePatchSimilarity" in source
-    with nerfstudio_repairs.without_lpips():
-        torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(normalize=True)
+    box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    config = SplatfactoModelConfig(random_init=True, num_random=8)
     with pytest.raises(Built):
-        torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity(normalize=True)
+        config.setup(scene_box=box, num_train_data=1, metadata={})
+    with nerfstudio_repairs.without_lpips():
+        config.setup(scene_box=box, num_train_data=1, metadata={})
 
 
 def test_nerfstudio_exits_without_an_ffmpeg_and_finds_the_one_that_is_provided(monkeypatch, tmp_path):

@@ -15,6 +15,7 @@ import yaml
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.training.checkpoints import PARTIAL, newest_first, staged_checkpoints
+from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 
 AS_NS_TRAIN = "import sys; sys.argv[0] = 'ns-train'\n"
 """Exceptions end the process as they end nerfstudio's command."""
@@ -190,3 +191,14 @@ def test_an_error_while_writing_leaves_the_folder_as_it_was(tmp_path):
 def test_a_configuration_is_written_with_names_that_load():
     written = yaml.dump(SSASplatfactoModelConfig(sparsity_weight=0.125))
     assert yaml.load(written, Loader=yaml.Loader) == SSASplatfactoModelConfig(sparsity_weight=0.125)
+
+
+def test_a_configuration_with_former_names_loads():
+    written = yaml.dump([SSASplatfactoModelConfig(sparsity_weight=0.125), FusedAdamConfig(lr=0.5)])
+    former = written.replace("plugin.model.SSASplatfactoModelConfig", "plugin.settings.SSASplatfactoModelConfig")
+    former = former.replace("plugin.training.fused_adam.", "plugin.fused_adam.")
+    assert former != written
+    code = "import yaml, ssa_nerfstudio.plugin.methods; "
+    code += f"print(yaml.load({former!r}, Loader=yaml.Loader)[0].sparsity_weight)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.strip().endswith("0.125"), done.stderr

@@ -1,0 +1,17 @@
+"""Names that config.yml files of earlier revisions contain, which `ns-eval`, `ns-viewer` and others load.
+
+May go with the first release.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from ssa_nerfstudio.plugin import model, settings
+from ssa_nerfstudio.plugin.training import fused_adam
+
+
+def provide_former_names() -> None:
+    """Let YAML find `plugin.fused_adam` and `plugin.settings.SSASplatfactoModelConfig`, which have moved."""
+    sys.modules.setdefault("ssa_nerfstudio.plugin.fused_adam", fused_adam)
+    vars(settings).setdefault("SSASplatfactoModelConfig", model.SSASplatfactoModelConfig)
