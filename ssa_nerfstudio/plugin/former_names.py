@@ -14,4 +14,4 @@ from ssa_nerfstudio.plugin.training import fused_adam
 def provide_former_names() -> None:
     """Let YAML find `plugin.fused_adam` and `plugin.settings.SSASplatfactoModelConfig`, which have moved."""
     sys.modules.setdefault("ssa_nerfstudio.plugin.fused_adam", fused_adam)
-    vars(settings).setdefault("SSASplatfactoModelConfig", model.SSASplatfactoModelConfig)
+    setattr(settings, "SSASplatfactoModelConfig", model.SSASplatfactoModelConfig)  # noqa: B010 - not a name of its own
