@@ -63,4 +63,4 @@ class Command:
             console.print(report.console_table(comparison))
             if not comparison.clean_test_views:
                 console.print(report.CORRUPTED, style="yellow")
-        console.print(f"Pictures and figures: {page}")
+        console.print(f"Images and metrics: {page}")

@@ -24,6 +24,8 @@ class Command(BenchCommand):
         """
         from rich.console import Console
 
+        # Before hours of training, so that a missing package is noticed now.
+        from ssa_nerfstudio.experiments.benchmark.report.tradeoff_report import analyze
         from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
         from ssa_nerfstudio.experiments.benchmark.specification.plan import plan_tradeoff
 
@@ -39,8 +41,6 @@ class Command(BenchCommand):
 
         chosen = {run.id for run in select(planned, self.scenes, self.only)}
         console = Console(highlight=False, soft_wrap=True)
-        from ssa_nerfstudio.experiments.benchmark.report.tradeoff_report import analyze
-
         files, problems = analyze([self.output, *self.merge], self.output / "tradeoff", chosen)
         for problem in problems:
             console.print(f"left out: {problem}", style="yellow")

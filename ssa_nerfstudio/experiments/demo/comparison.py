@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.effects.watermark import Watermark
 from ssa_nerfstudio.experiments.runs.machine import versions
@@ -51,12 +51,12 @@ class Demonstration:
     comparisons: list[Comparison] = field(default_factory=list)
 
     def results(self) -> dict[str, Any]:
-        """For results.json: each method's figures on the first dataset, and all of them under `datasets`."""
+        """For results.json: each method's metrics on the first dataset, and all of them under `datasets`."""
         first = self.comparisons[0]
-        figures = {c.name: {m: _figures(o) for m, o in c.outcomes.items()} for c in self.comparisons}
+        metrics = {c.name: {m: _metrics(o) for m, o in c.outcomes.items()} for c in self.comparisons}
         return {
-            **figures[first.name],
-            "datasets": figures,
+            **metrics[first.name],
+            "datasets": metrics,
             "clean_test_views": first.clean_test_views,
             "versions": versions(),
         }
@@ -100,7 +100,7 @@ def compare(
             config, lambda step, method=method: on_step(name, method, step)
         )
         configs[method] = str(path)
-    named = "test_filenames" in json.loads((data / "transforms.json").read_text()) if data.is_dir() else False
+    named = Transforms.read(data).stated_split("test") is not None
     return Comparison(name, outcomes, _pictures(pipelines), configs, clean_test_views=named)
 
 
@@ -117,7 +117,7 @@ def _pictures(pipelines: dict[str, SSAPipeline]) -> dict[str, np.ndarray]:
     }
 
 
-def _figures(outcome: Outcome) -> dict[str, Any]:
+def _metrics(outcome: Outcome) -> dict[str, Any]:
     return {
         **{name: value for name, value in outcome.metrics.items() if not name.endswith("_std")},
         "seconds": sum(outcome.seconds.values()),

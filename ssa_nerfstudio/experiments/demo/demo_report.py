@@ -26,7 +26,7 @@ CORRUPTED = (
 
 
 def console_table(comparison: Comparison) -> Table:
-    """The figures of one dataset for the terminal."""
+    """The metrics of one dataset for the terminal."""
     table = Table(title=f"{comparison.name}: the clean scene against held-out test views")
     for heading in HEADINGS:
         table.add_column(heading, justify="left" if not heading else "right", no_wrap=not heading)

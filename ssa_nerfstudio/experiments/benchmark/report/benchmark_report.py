@@ -118,7 +118,7 @@ def _section(study: Study, with_paper: bool) -> Section:
     if len(seeds) < 2:
         text.append("One seed: differences below about 0.3 dB are noise until they have been repeated.")
     if with_paper:
-        text.append("The paper's protocol: its figures stand below ours. gsplat's own clean ADC reference is 28.95.")
+        text.append("The paper's protocol: its metrics are below ours. gsplat's own clean ADC reference is 28.95.")
     return Section(study.title, text, [table for table in drawn if table is not None])
 
 

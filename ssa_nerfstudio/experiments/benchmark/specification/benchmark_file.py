@@ -121,7 +121,7 @@ class Benchmark:
     method: str = "ssa-splatfacto"
     """nerfstudio method that every row starts from: ssa-splatfacto, or ssa-splatfacto-paper."""
     protocol: Literal["own", "paper"] = "own"
-    """paper: data, splits, resolutions, caps and schedules are the paper's, so its figures stand beside ours."""
+    """paper: data, splits, resolutions, caps and schedules are the paper's, so that its metrics are comparable."""
     model: dict[str, Any] = field(default_factory=dict)
     """Settings of the model for all runs."""
     candidates: dict[str, dict[str, Any]] = field(default_factory=dict)
