@@ -46,8 +46,8 @@ class Command:
 
     def run(self) -> None:
         """Train in turns and print one line."""
-        if CHECK_EVERY % self.block or self.pairs < 3:
-            raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 3")
+        if CHECK_EVERY % self.block or self.pairs < 4:
+            raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 4")
         with TemporaryDirectory() as folder:
             training = self._training(Path(folder))
             for _ in range(self.grow):
