@@ -61,7 +61,7 @@ class Command:
             raise InputError(f"{self.benchmark} states no parts", f"`ssa tradeoff {self.benchmark}` may be meant")
         left = update(self, "bench", benchmark, runs)
         if left == 0 and not (self.prepare_only or self.list):
-            print(f"All {self.benchmark} requested runs are done: ssa report {self.output}")
+            print(f"All {self.benchmark} runs that were requested are done: ssa report {self.output}")
 
 
 def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]) -> int:
