@@ -6,7 +6,6 @@ import logging
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Literal
 
 import torch
@@ -19,6 +18,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.training.checkpoints import (
+    LOAD_ERRORS,
     damage,
     load_pipeline_state,
     newest_first,
@@ -133,7 +133,7 @@ class SSATrainer(Trainer):
             super()._load_checkpoint()
         except InputError:
             raise  # of the settings: no other checkpoint helps
-        except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError) as error:
+        except LOAD_ERRORS as error:
             return (str(error) or type(error).__name__).splitlines()[0]
         broken = first_nonfinite(self.pipeline.state_dict())
         return None if broken is None else f"its {broken} holds values that are not finite"

@@ -15,6 +15,8 @@ from ssa_nerfstudio.data.writing import staged_files
 PARTIAL = "checkpoint.partial"
 """Folder of a run in which a checkpoint is written; a killed run leaves it behind, and it is never read. It is not in
 the checkpoints' folder, because nerfstudio takes every name there for a checkpoint's."""
+LOAD_ERRORS = (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError)
+"""What `torch.load` and a state dict raise for a file that is no usable checkpoint."""
 
 
 def step_of(checkpoint: Path) -> int:
@@ -46,5 +48,5 @@ def load_pipeline_state(checkpoint: Path) -> dict[str, Any] | None:
     """The pipeline's state in a checkpoint, memory-mapped; None where it cannot be read."""
     try:
         return torch.load(checkpoint, map_location="cpu", mmap=True, weights_only=True)["pipeline"]
-    except (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError):
+    except LOAD_ERRORS:
         return None
