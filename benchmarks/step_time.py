@@ -24,7 +24,7 @@ from nerfstudio.utils import writer
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.transforms import Transforms
-from ssa_nerfstudio.experiments.runs.run_configuration import METHODS
+from ssa_nerfstudio.plugin.methods import METHODS
 
 FIRST, LAST = 699, 1099
 """Steps between which the time is taken: after Triton's compilation and the first refinement, at step 600, which takes

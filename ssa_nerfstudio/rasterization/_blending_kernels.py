@@ -3,153 +3,138 @@
 A band belongs to one thread and its splats come in order of depth, so the image does not depend on the number of
 threads; gradients are written once per (splat, band) and summed in a fixed order afterwards, so they do not either.
 
-Along a row of pixels the exponent of a Gaussian is a parabola, so alpha obeys a recurrence of two multiplications:
-alpha(x + 1) = alpha(x) * step(x), step(x + 1) = step(x) * exp(-xx). It replaces an exponential at each pixel, and runs
-in float64, where a row's rounding stays near 1e-14. Its roots bound the pixels with alpha >= 1/255.
+Pixels are blended in blocks of eight along a row. A block's values lie side by side, eight transmittances, then eight
+reds and so on, at offsets that LLVM knows to be apart: so the loop over a block becomes one sequence of vector
+instructions, 256 bits in float32, without a branch.
 
-Shapes: V splats nearest first, B bands, S (splat, band) pairs; `rows` of a band are its pixel rows.
+Shapes: V splats nearest first, B bands, S (splat, band) pairs; `shapes` and `bounds` are those of `_splat_lists`.
+`scratch` [threads, floats] has room for one band's blocks, `scratch_size` floats. Ranks are exact up to 2^24 splats.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
-from numba import njit
+from numba import carray, njit, types  # pyright: ignore[reportPrivateImportUsage]
+from numba.core import cgutils
+from numba.extending import intrinsic
 
+from ssa_nerfstudio.rasterization._exponential import exp_negative
+from ssa_nerfstudio.rasterization._splat_lists import BLOCK, extent_of_splat, row_of_splat
 from ssa_nerfstudio.rasterization.constants import ALPHA_MAX, ALPHA_MIN, TILE, TRANSMITTANCE_MIN
 
 GRADIENTS = 12
 """Columns of a partial gradient: center x y, |center| x y, conic xx xy yy, opacity, color r g b, depth."""
+PLANES = 7
+"""Values of a pixel in `scratch`. Forward: transmittance, negative once the pixel is done; red, green, blue, depth;
+last. Backward: transmittance in front of the splats walked so far, cotangent of what lies behind the current splat,
+cotangents of red, green, blue and depth; last."""
 
 
-@njit(cache=True, nogil=True)
-def assign_bands(bounds, n_bands):
-    """List each band's splats, nearest first.
-
-    Args:
-        bounds: [V, 4] int32, tile-aligned pixel bounds x0, x1, y0, y1 (half open, within the image).
-
-    Returns:
-        starts [B + 1] and members [S]: band b draws splats members[starts[b] : starts[b + 1]];
-        slots [V + 1]: splat v writes its gradients for its k-th band to row slots[v] + k.
-    """
-    n = bounds.shape[0]
-    slots = np.zeros(n + 1, np.int64)
-    starts = np.zeros(n_bands + 1, np.int64)
-    for v in range(n):
-        first, last = bounds[v, 2] // TILE, (bounds[v, 3] + TILE - 1) // TILE
-        if bounds[v, 1] <= bounds[v, 0]:
-            last = first
-        last = max(first, last)
-        slots[v + 1] = slots[v] + last - first
-        for band in range(first, last):
-            starts[band + 1] += 1
-    for band in range(n_bands):
-        starts[band + 1] += starts[band]
-    members = np.empty(starts[n_bands], np.int32)
-    filled = starts[:-1].copy()
-    for v in range(n):
-        first = bounds[v, 2] // TILE
-        for band in range(first, first + slots[v + 1] - slots[v]):
-            members[filled[band]] = v
-            filled[band] += 1
-    return starts, members, slots
+def scratch_size(width: int) -> int:
+    """Floats of scratch that a thread needs for images of this width."""
+    return TILE * -(-width // BLOCK) * PLANES * BLOCK
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _row_span(dy, xx, xy, yy, reach, center, x0, x1):
-    """Columns [first, last) of a row at height dy above the center where the exponent is at most reach / 2."""
-    discriminant = xy * xy * dy * dy - xx * (yy * dy * dy - reach)
-    if not discriminant >= 0.0:
-        return 0, 0
-    root = math.sqrt(discriminant)
-    left = center - 0.5 + (-xy * dy - root) / xx
-    right = center - 0.5 + (-xy * dy + root) / xx
-    first = x0 if left < x0 else (x1 if left > x1 else math.ceil(left))
-    last = x1 if right > x1 - 1 else (x0 if right < x0 else math.floor(right) + 1)
-    return int(first), int(last)
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+def blend_bands(thread, threads, starts, members, shapes, bounds, colors, scratch, image, transmittance, last):
+    """Blend bands thread, thread + threads, ... into image [H, W, 4], transmittance [H, W], last [H, W].
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def blend_bands(
-    first_band, step_band, starts, members, centers, conics, opacities, colors, bounds, image, transmittance, last
-):
-    """Blend bands first_band, first_band + step_band, ... into image [H, W, 4], transmittance [H, W], last [H, W].
-
-    `transmittance` comes in as ones and `image` as zeros; `last` becomes the number of the band's splats up to the
-    last one that was drawn at the pixel.
+    `last` becomes the number of the band's splats up to the last one that was drawn at the pixel.
     """
     height, width = transmittance.shape
-    done = np.zeros((TILE, width), np.bool_)
-    live = np.zeros(TILE, np.int64)
-    for band in range(first_band, starts.shape[0] - 1, step_band):
+    real = colors.dtype.type
+    zero, one = real(0.0), real(1.0)
+    alpha_min, alpha_max, transmittance_min = real(ALPHA_MIN), real(ALPHA_MAX), real(TRANSMITTANCE_MIN)
+    blocks = (width + BLOCK - 1) // BLOCK
+    pixels = scratch[thread]
+    live = np.empty((TILE, blocks), np.bool_)
+    for band in range(thread, starts.shape[0] - 1, threads):
         top = band * TILE
         bottom = min(top + TILE, height)
-        done[:] = False
-        live[:] = width
-        rows_left = bottom - top
+        pixels[:] = zero
+        live[:] = True
+        n_live = (bottom - top) * blocks
+        for row in range(bottom - top):
+            for block in range(blocks):
+                at = (row * blocks + block) * PLANES * BLOCK
+                for j in range(min(BLOCK, width - block * BLOCK)):
+                    pixels[at + j] = one
         for s in range(starts[band], starts[band + 1]):
-            if rows_left == 0:
+            if n_live == 0:
                 break
             v = members[s]
-            opacity = float(opacities[v])
-            xx, xy, yy = float(conics[v, 0]), float(conics[v, 1]), float(conics[v, 2])
-            if not (opacity >= ALPHA_MIN and xx > 0.0):
-                continue
-            reach = 2.0 * math.log(opacity / ALPHA_MIN)
-            cx, cy = float(centers[v, 0]), float(centers[v, 1])
-            ratio = math.exp(-xx)
-            r, g, b, d = float(colors[v, 0]), float(colors[v, 1]), float(colors[v, 2]), float(colors[v, 3])
+            extent = extent_of_splat(shapes, bounds, v)
+            narrowness, opacity = real(shapes[v, 3]), real(shapes[v, 7])
+            r, g, b, d = colors[v, 0], colors[v, 1], colors[v, 2], colors[v, 3]
+            rank = real(s - starts[band] + 1)
             for y in range(max(top, bounds[v, 2]), min(bottom, bounds[v, 3])):
-                row = y - top
-                if live[row] == 0:
-                    continue
-                dy = y + 0.5 - cy
-                x_first, x_last = _row_span(dy, xx, xy, yy, reach, cx, bounds[v, 0], bounds[v, 1])
-                if x_first >= x_last:
-                    continue
-                dx = x_first + 0.5 - cx
-                alpha = opacity * math.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
-                step = math.exp(-(xx * (dx + 0.5) + xy * dy))
-                for x in range(x_first, x_last):
-                    if not done[row, x]:
-                        drawn = min(alpha, ALPHA_MAX)
-                        before = transmittance[y, x]
-                        after = before * (1.0 - drawn)
-                        if after <= TRANSMITTANCE_MIN:
-                            done[row, x] = True
-                            live[row] -= 1
-                            if live[row] == 0:
-                                rows_left -= 1
-                        else:
-                            weight = drawn * before
-                            image[y, x, 0] += weight * r
-                            image[y, x, 1] += weight * g
-                            image[y, x, 2] += weight * b
-                            image[y, x, 3] += weight * d
-                            transmittance[y, x] = after
-                            last[y, x] = s - starts[band] + 1
-                    alpha *= step
-                    step *= ratio
+                _, sigma, middle, first, end = row_of_splat(extent, y)
+                sigma_row = real(sigma)
+                for block in range(first, end):
+                    if not live[y - top, block]:
+                        continue
+                    at = np.uintp(((y - top) * blocks + block) * PLANES * BLOCK)
+                    left = real(block * BLOCK - middle)
+                    any_live = False
+                    for j in range(BLOCK):
+                        i = at + np.uintp(j)
+                        t = left + real(j)
+                        alpha = opacity * exp_negative(-(narrowness * t * t + sigma_row))
+                        before = pixels[i]
+                        touched = alpha >= alpha_min
+                        drawn = min(alpha, alpha_max)
+                        after = before * (one - drawn)
+                        visible = touched and after > transmittance_min
+                        weight = drawn * before if visible else zero
+                        pixels[i + np.uintp(1 * BLOCK)] += weight * r
+                        pixels[i + np.uintp(2 * BLOCK)] += weight * g
+                        pixels[i + np.uintp(3 * BLOCK)] += weight * b
+                        pixels[i + np.uintp(4 * BLOCK)] += weight * d
+                        if visible:
+                            pixels[i + np.uintp(5 * BLOCK)] = rank
+                        remaining = after if visible else (-abs(before) if touched else before)
+                        pixels[i] = remaining
+                        any_live |= remaining > zero
+                    if not any_live:
+                        live[y - top, block] = False
+                        n_live -= 1
+        for y in range(top, bottom):
+            for block in range(blocks):
+                at = ((y - top) * blocks + block) * PLANES * BLOCK
+                for j in range(min(BLOCK, width - block * BLOCK)):
+                    i, x = at + j, block * BLOCK + j
+                    transmittance[y, x] = abs(pixels[i])
+                    for channel in range(4):
+                        image[y, x, channel] = pixels[i + (1 + channel) * BLOCK]
+                    last[y, x] = pixels[i + 5 * BLOCK]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@intrinsic
+def _twelve_sums(typing_context, like):
+    """Pointer to GRADIENTS x BLOCK numbers of a type on the stack, where LLVM knows that no array overlaps them."""
+
+    def allocate(context, builder, signature, arguments):
+        return cgutils.alloca_once(builder, context.get_value_type(like), size=GRADIENTS * BLOCK)
+
+    return types.CPointer(like)(like), allocate
+
+
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def backpropagate_bands(
-    first_band,
-    step_band,
+    thread,
+    threads,
     starts,
     members,
     slots,
-    centers,
-    conics,
-    opacities,
-    colors,
+    shapes,
     bounds,
+    conics,
+    colors,
     transmittance,
     last,
     v_image,
     v_alpha,
+    scratch,
     partial,
 ):
     """Write the gradient of every (splat, band) pair of these bands into partial [S, GRADIENTS].
@@ -158,88 +143,99 @@ def backpropagate_bands(
     recovered by a division by at least 1 - 0.999. `v_image` [H, W, 4] and `v_alpha` [H, W] are the cotangents.
     """
     height, width = transmittance.shape
-    before = np.empty((TILE, width), np.float64)  # transmittance in front of the splats walked so far
-    behind = np.empty((TILE, width), np.float64)  # cotangent of what lies behind the current splat
-    row_last = np.zeros(TILE, np.int64)
-    for band in range(first_band, starts.shape[0] - 1, step_band):
+    real = colors.dtype.type
+    zero, one = real(0.0), real(1.0)
+    alpha_min, alpha_max = real(ALPHA_MIN), real(ALPHA_MAX)
+    blocks = (width + BLOCK - 1) // BLOCK
+    pixels = scratch[thread]
+    deepest = np.empty((TILE, blocks), np.int64)
+    sums = carray(_twelve_sums(zero), GRADIENTS * BLOCK)  # pyright: ignore[reportCallIssue]
+    total = np.empty(GRADIENTS, np.float64)
+    for band in range(thread, starts.shape[0] - 1, threads):
         top = band * TILE
         bottom = min(top + TILE, height)
-        deepest = 0
+        pixels[:] = zero
+        ranks = 0
         for y in range(top, bottom):
-            row = y - top
-            row_last[row] = 0
-            for x in range(width):
-                before[row, x] = transmittance[y, x]
-                behind[row, x] = -transmittance[y, x] * v_alpha[y, x]
-                row_last[row] = max(row_last[row], last[y, x])
-            deepest = max(deepest, row_last[row])
-        for s in range(starts[band] + deepest - 1, starts[band] - 1, -1):
+            for block in range(blocks):
+                at = ((y - top) * blocks + block) * PLANES * BLOCK
+                most = 0
+                for j in range(min(BLOCK, width - block * BLOCK)):
+                    i, x = at + j, block * BLOCK + j
+                    pixels[i] = transmittance[y, x]
+                    pixels[i + BLOCK] = -transmittance[y, x] * v_alpha[y, x]
+                    for channel in range(4):
+                        pixels[i + (2 + channel) * BLOCK] = v_image[y, x, channel]
+                    pixels[i + 6 * BLOCK] = last[y, x]
+                    most = max(most, last[y, x])
+                deepest[y - top, block] = most
+                ranks = max(ranks, most)
+        for s in range(starts[band] + ranks - 1, starts[band] - 1, -1):
             v = members[s]
-            opacity = float(opacities[v])
-            xx, xy, yy = float(conics[v, 0]), float(conics[v, 1]), float(conics[v, 2])
-            if not (opacity >= ALPHA_MIN and xx > 0.0):
-                continue
+            extent = extent_of_splat(shapes, bounds, v)
+            narrowness, opacity = real(shapes[v, 3]), real(shapes[v, 7])
+            shear, falloff = shapes[v, 2], shapes[v, 5]
+            r, g, b, d = colors[v, 0], colors[v, 1], colors[v, 2], colors[v, 3]
+            slope_x, slope_y = conics[v, 1], real(2.0 * falloff)
             rank = s - starts[band] + 1
-            reach = 2.0 * math.log(opacity / ALPHA_MIN)
-            cx, cy = float(centers[v, 0]), float(centers[v, 1])
-            ratio = math.exp(-xx)
-            r, g, b, d = float(colors[v, 0]), float(colors[v, 1]), float(colors[v, 2]), float(colors[v, 3])
-            v_x = v_y = v_abs_x = v_abs_y = v_xx = v_xy = v_yy = v_opacity = v_r = v_g = v_b = v_d = 0.0
+            sums[:] = zero
             for y in range(max(top, bounds[v, 2]), min(bottom, bounds[v, 3])):
-                row = y - top
-                if rank > row_last[row]:
-                    continue
-                dy = y + 0.5 - cy
-                x_first, x_last = _row_span(dy, xx, xy, yy, reach, cx, bounds[v, 0], bounds[v, 1])
-                if x_first >= x_last:
-                    continue
-                dx = x_first + 0.5 - cx
-                alpha = opacity * math.exp(-0.5 * (xx * dx * dx + yy * dy * dy) - xy * dx * dy)
-                step = math.exp(-(xx * (dx + 0.5) + xy * dy))
-                for x in range(x_first, x_last):
-                    if rank <= last[y, x]:
-                        drawn = min(alpha, ALPHA_MAX)
-                        inverse = 1.0 / (1.0 - drawn)
-                        ahead = before[row, x] * inverse
-                        weight = drawn * ahead
-                        g_r, g_g = float(v_image[y, x, 0]), float(v_image[y, x, 1])
-                        g_b, g_d = float(v_image[y, x, 2]), float(v_image[y, x, 3])
+                dy, sigma, middle, first, end = row_of_splat(extent, y)
+                down, sigma_row = real(dy), real(sigma)
+                for block in range(first, end):
+                    if deepest[y - top, block] < rank:
+                        continue
+                    at = np.uintp(((y - top) * blocks + block) * PLANES * BLOCK)
+                    left = real(block * BLOCK - middle)
+                    for j in range(BLOCK):
+                        k = np.uintp(j)
+                        i = at + k
+                        t = left + real(j)
+                        alpha = opacity * exp_negative(-(narrowness * t * t + sigma_row))
+                        visible = (alpha >= alpha_min) & (pixels[i + np.uintp(6 * BLOCK)] >= real(rank))
+                        drawn = min(alpha, alpha_max)
+                        inverse = one / (one - drawn)
+                        before, behind = pixels[i], pixels[i + np.uintp(1 * BLOCK)]
+                        ahead = before * inverse
+                        weight = drawn * ahead if visible else zero
+                        g_r, g_g = pixels[i + np.uintp(2 * BLOCK)], pixels[i + np.uintp(3 * BLOCK)]
+                        g_b, g_d = pixels[i + np.uintp(4 * BLOCK)], pixels[i + np.uintp(5 * BLOCK)]
                         cotangent = r * g_r + g * g_g + b * g_b + d * g_d
-                        v_r += weight * g_r
-                        v_g += weight * g_g
-                        v_b += weight * g_b
-                        v_d += weight * g_d
-                        if alpha <= ALPHA_MAX:
-                            v_drawn = ahead * cotangent - behind[row, x] * inverse
-                            v_opacity += alpha * v_drawn
-                            v_sigma = -alpha * v_drawn
-                            v_xx += v_sigma * dx * dx
-                            v_xy += v_sigma * dx * dy
-                            v_yy += v_sigma * dy * dy
-                            pixel_x = -v_sigma * (xx * dx + xy * dy)
-                            pixel_y = -v_sigma * (xy * dx + yy * dy)
-                            v_x += pixel_x
-                            v_y += pixel_y
-                            v_abs_x += abs(pixel_x)
-                            v_abs_y += abs(pixel_y)
-                        before[row, x] = ahead
-                        behind[row, x] += weight * cotangent
-                    alpha *= step
-                    step *= ratio
-                    dx += 1.0
+                        v_drawn = ahead * cotangent - behind * inverse
+                        value = alpha * v_drawn if visible and alpha <= alpha_max else zero
+                        pixels[i] = ahead if visible else before
+                        pixels[i + np.uintp(1 * BLOCK)] = behind + weight * cotangent
+                        value_x, value_y = value * t, value * down
+                        sums[k] += value
+                        sums[k + np.uintp(1 * BLOCK)] += value_x
+                        sums[k + np.uintp(2 * BLOCK)] += value_y
+                        sums[k + np.uintp(3 * BLOCK)] += value_x * t
+                        sums[k + np.uintp(4 * BLOCK)] += value_y * t
+                        sums[k + np.uintp(5 * BLOCK)] += value_y * down
+                        sums[k + np.uintp(6 * BLOCK)] += abs(value_x)
+                        sums[k + np.uintp(7 * BLOCK)] += abs(value * (slope_x * t + slope_y * down))
+                        sums[k + np.uintp(8 * BLOCK)] += weight * g_r
+                        sums[k + np.uintp(9 * BLOCK)] += weight * g_g
+                        sums[k + np.uintp(10 * BLOCK)] += weight * g_b
+                        sums[k + np.uintp(11 * BLOCK)] += weight * g_d
+            for column in range(GRADIENTS):
+                i = column * BLOCK
+                low = (float(sums[i]) + sums[i + 1]) + (float(sums[i + 2]) + sums[i + 3])
+                high = (float(sums[i + 4]) + sums[i + 5]) + (float(sums[i + 6]) + sums[i + 7])
+                total[column] = low + high
+            # d sigma = -value, and t = dx + shear dy
+            xx, xy = conics[v, 0], conics[v, 1]
             slot = slots[v] + band - bounds[v, 2] // TILE
-            partial[slot, 0] = v_x
-            partial[slot, 1] = v_y
-            partial[slot, 2] = v_abs_x
-            partial[slot, 3] = v_abs_y
-            partial[slot, 4] = 0.5 * v_xx
-            partial[slot, 5] = v_xy
-            partial[slot, 6] = 0.5 * v_yy
-            partial[slot, 7] = v_opacity / opacity
-            partial[slot, 8] = v_r
-            partial[slot, 9] = v_g
-            partial[slot, 10] = v_b
-            partial[slot, 11] = v_d
+            partial[slot, 0] = xx * total[1]
+            partial[slot, 1] = xy * total[1] + 2.0 * falloff * total[2]
+            partial[slot, 2] = xx * total[6]
+            partial[slot, 3] = total[7]
+            partial[slot, 4] = -0.5 * (total[3] - 2.0 * shear * total[4] + shear * shear * total[5])
+            partial[slot, 5] = -(total[4] - shear * total[5])
+            partial[slot, 6] = -0.5 * total[5]
+            partial[slot, 7] = total[0] / shapes[v, 7]
+            for channel in range(4):
+                partial[slot, 8 + channel] = total[8 + channel]
 
 
 @njit(cache=True, nogil=True)

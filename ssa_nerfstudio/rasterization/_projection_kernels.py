@@ -3,6 +3,9 @@
 The formulas are those of `projection.project` (EWA splatting, Zwicker et al. 2002, as in gsplat 1.4.0), chained by
 hand: some two hundred small torch operations forward and back take longer than blending the splats does. A thread owns
 a contiguous range of Gaussians; a Gaussian's gradients depend on it alone, so results do not depend on the threads.
+
+Gaussians are visited in the order of memory, not of depth: `places` [N] int32 has the rank in depth of each among the V
+drawn ones, -1 where it is not drawn.
 """
 
 from __future__ import annotations
@@ -93,16 +96,32 @@ def project_gaussians(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def backpropagate_projection(
-    thread, threads, ids, means, quats, scales, viewmat, K, width, height, eps2d, v_splats, v_means, v_quats, v_scales
+    thread,
+    threads,
+    places,
+    means,
+    quats,
+    scales,
+    viewmat,
+    K,
+    width,
+    height,
+    eps2d,
+    v_splats,
+    v_means,
+    v_quats,
+    v_scales,
 ):
     """Add to v_means [N, 3], v_quats [N, 4], v_scales [N, 3] what v_splats [V, 6] (as geometry) contributes."""
-    n = ids.shape[0]
+    n = places.shape[0]
     fx, fy = K[0, 0], K[1, 1]
     x_min, x_max, y_min, y_max = _limits(K, width, height)
     rotation, turned, axes = np.empty((3, 3)), np.empty((3, 3)), np.empty((2, 3))
     v_axes, v_rotation = np.empty((2, 3)), np.empty((3, 3))
-    for s in range(n * thread // threads, n * (thread + 1) // threads):
-        i = ids[s]
+    for i in range(n * thread // threads, n * (thread + 1) // threads):
+        s = places[i]
+        if s < 0:
+            continue
         m0, m1, m2 = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
         x = viewmat[0, 0] * m0 + viewmat[0, 1] * m1 + viewmat[0, 2] * m2 + viewmat[0, 3]
         y = viewmat[1, 0] * m0 + viewmat[1, 1] * m1 + viewmat[1, 2] * m2 + viewmat[1, 3]
@@ -195,44 +214,48 @@ def _bases(degree, x, y, z, Y):
 
 
 @njit(cache=True, nogil=True)
-def shade(thread, threads, ids, means, center, coefficients, degree, colors):
+def shade(thread, threads, places, means, center, coefficients, degree, colors):
     """Fill colors [V, 0:3] with max(0, 0.5 + sum_k Y_k c_k) in the direction from the camera's center [3]."""
-    n = ids.shape[0]
+    n = places.shape[0]
     bases = (degree + 1) ** 2
     Y = np.empty(16)
-    for s in range(n * thread // threads, n * (thread + 1) // threads):
-        i = ids[s]
+    for i in range(n * thread // threads, n * (thread + 1) // threads):
+        s = places[i]
+        if s < 0:
+            continue
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         norm = max(math.sqrt(x * x + y * y + z * z), NORM_MIN)
         _bases(degree, x / norm, y / norm, z / norm, Y)
-        for c in range(3):
-            value = 0.5
-            for k in range(bases):
-                value += Y[k] * coefficients[i, k, c]
-            colors[s, c] = max(value, 0.0)
+        r, g, b = 0.5, 0.5, 0.5
+        for k in range(bases):
+            r += Y[k] * coefficients[i, k, 0]
+            g += Y[k] * coefficients[i, k, 1]
+            b += Y[k] * coefficients[i, k, 2]
+        colors[s, 0], colors[s, 1], colors[s, 2] = max(r, 0.0), max(g, 0.0), max(b, 0.0)
 
 
 @njit(cache=True, nogil=True)
 def backpropagate_shading(
-    thread, threads, ids, means, center, coefficients, degree, colors, v_colors, v_means, v_coefficients
+    thread, threads, places, means, center, coefficients, degree, colors, v_colors, v_means, v_coefficients
 ):
-    """Add to v_means [N, 3] and v_coefficients [N, K, 3] what v_colors [V, 0:3] contributes; none where clamped."""
-    n = ids.shape[0]
+    """Add to v_means [N, 3] what v_colors [V, 0:3] contributes, none where clamped; write v_coefficients [N, K, 3]."""
+    n = places.shape[0]
     bases = (degree + 1) ** 2
     Y, dot = np.empty(16), np.zeros(16)
-    for s in range(n * thread // threads, n * (thread + 1) // threads):
-        i = ids[s]
+    for i in range(n * thread // threads, n * (thread + 1) // threads):
+        s = places[i]
+        if s < 0:
+            continue
         x, y, z = means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         norm = max(math.sqrt(x * x + y * y + z * z), NORM_MIN)
         x, y, z = x / norm, y / norm, z / norm
         _bases(degree, x, y, z, Y)
-        dot[:] = 0
-        for c in range(3):
-            v = float(v_colors[s, c])
-            if colors[s, c] > 0:
-                for k in range(bases):
-                    v_coefficients[i, k, c] += Y[k] * v
-                    dot[k] += coefficients[i, k, c] * v
+        r = float(v_colors[s, 0]) if colors[s, 0] > 0 else 0.0
+        g = float(v_colors[s, 1]) if colors[s, 1] > 0 else 0.0
+        b = float(v_colors[s, 2]) if colors[s, 2] > 0 else 0.0
+        for k in range(bases):
+            v_coefficients[i, k, 0], v_coefficients[i, k, 1], v_coefficients[i, k, 2] = Y[k] * r, Y[k] * g, Y[k] * b
+            dot[k] = coefficients[i, k, 0] * r + coefficients[i, k, 1] * g + coefficients[i, k, 2] * b
         if degree == 0:
             continue
         v_x = -C1 * dot[3]

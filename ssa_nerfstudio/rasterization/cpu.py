@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio._system.kernel_threads import on_all_threads
-from ssa_nerfstudio.rasterization import _blending_kernels as _kernels
+from ssa_nerfstudio.rasterization import _blending_kernels as kernels
+from ssa_nerfstudio.rasterization import _splat_lists as lists
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.cpu_projection import project
 from ssa_nerfstudio.rasterization.interface import make_rasterization
@@ -58,40 +59,32 @@ class _Blend(torch.autograd.Function):
     @staticmethod
     def forward(ctx, means2d, conics, opacities, colors, ids, radii, camera, width, height, absgrad):  # pyright: ignore
         centers = np.ascontiguousarray(means2d.detach()[camera, ids].numpy())
-        arrays = [np.ascontiguousarray(t.detach().numpy()) for t in (conics, opacities, colors)]
-        bounds = _tile_bounds(centers, radii.numpy(), width, height)
-        bands = _kernels.assign_bands(bounds, -(-height // TILE))
-        image = np.zeros((height, width, 4), centers.dtype)
-        transmittance = np.ones((height, width), centers.dtype)
-        last = np.zeros((height, width), np.int32)
-        starts, members, _ = bands
-        on_all_threads(_kernels.blend_bands, starts, members, centers, *arrays, bounds, image, transmittance, last)
+        conics, opacities, colors = (np.ascontiguousarray(t.detach().numpy()) for t in (conics, opacities, colors))
+        shapes = np.empty((len(centers), lists.SHAPE), np.float64)
+        bounds = np.empty((len(centers), 4), np.int32)
+        on_all_threads(lists.shape_splats, centers, conics, opacities, radii.numpy(), width, height, shapes, bounds)
+        starts, members, slots = lists.assign_bands(bounds, -(-height // TILE))
+        image = np.empty((height, width, 4), centers.dtype)
+        transmittance = np.empty((height, width), centers.dtype)
+        last = np.empty((height, width), np.int32)
+        splats = (shapes, bounds)
+        scratch = np.empty((torch.get_num_threads(), kernels.scratch_size(width)), centers.dtype)
+        on_all_threads(kernels.blend_bands, starts, members, *splats, colors, scratch, image, transmittance, last)
         ctx.save_for_backward(means2d, ids)
-        ctx.blended = (bands, centers, arrays, bounds, transmittance, last)
+        ctx.blended = (starts, members, slots, *splats, conics, colors, transmittance, last)
         ctx.camera, ctx.absgrad = camera, absgrad
         return torch.from_numpy(image), torch.from_numpy(1 - transmittance[..., None])
 
     @staticmethod
     def backward(ctx, v_image, v_alpha):  # pyright: ignore[reportIncompatibleMethodOverride]
         means2d, ids = ctx.saved_tensors
-        (starts, members, slots), centers, arrays, bounds, transmittance, last = ctx.blended
-        partial = np.zeros((len(members), _kernels.GRADIENTS), np.float64)
-        on_all_threads(
-            _kernels.backpropagate_bands,
-            starts,
-            members,
-            slots,
-            centers,
-            *arrays,
-            bounds,
-            transmittance,
-            last,
-            v_image.contiguous().numpy(),
-            v_alpha[..., 0].contiguous().numpy(),
-            partial,
-        )
-        total = np.empty((len(centers), _kernels.GRADIENTS), centers.dtype)
-        _kernels.sum_partials(slots, partial, total)
+        members, slots, conics = ctx.blended[1], ctx.blended[2], ctx.blended[5]
+        partial = np.zeros((len(members), kernels.GRADIENTS), np.float64)
+        scratch = np.empty((torch.get_num_threads(), kernels.scratch_size(v_image.shape[1])), conics.dtype)
+        v_pixels = (v_image.contiguous().numpy(), v_alpha[..., 0].contiguous().numpy())
+        on_all_threads(kernels.backpropagate_bands, *ctx.blended, *v_pixels, scratch, partial)
+        total = np.empty((len(conics), kernels.GRADIENTS), conics.dtype)
+        kernels.sum_partials(slots, partial, total)
         v = torch.from_numpy(total)
         v_means2d = torch.zeros_like(means2d)
         v_means2d[ctx.camera, ids] = v[:, 0:2]
@@ -101,15 +94,3 @@ class _Blend(torch.autograd.Function):
                 means2d.absgrad = torch.zeros_like(means2d)
             means2d.absgrad[ctx.camera, ids] = v[:, 2:4]
         return v_means2d, v[:, 4:7], v[:, 7], v[:, 8:12], None, None, None, None, None, None
-
-
-def _tile_bounds(centers: np.ndarray, radii: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Pixel bounds x0, x1, y0, y1 [V, 4] int32 of the tiles that each splat's three-sigma square touches."""
-    size = np.array([width, height])
-    tiles = -(-size // TILE)
-    lower = np.clip(np.floor((centers - radii[:, None]) / TILE), 0, tiles)
-    upper = np.clip(np.ceil((centers + radii[:, None]) / TILE), 0, tiles)
-    bounds = np.empty((len(centers), 4), np.int32)
-    bounds[:, 0::2] = lower * TILE
-    bounds[:, 1::2] = np.minimum(upper * TILE, size)
-    return bounds
