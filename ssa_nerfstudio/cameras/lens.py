@@ -1,4 +1,8 @@
-"""Lenses: nerfstudio's undistortion of photos (warp, crop, intrinsics) and its inverse."""
+"""Lenses: the undistortion of photos (warp, crop, intrinsics) and its inverse.
+
+It is nerfstudio's, except for fisheye lenses. nerfstudio takes photos of ideal ones for perspective ones, and of those
+wider than `WIDEST` it spends most of the frame on the rim, beyond 180 degrees all of it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,11 @@ import cv2
 import numpy as np
 
 from ssa_nerfstudio.errors import InputError
+
+WIDEST = 120.0
+"""Angle of view, in degrees, that the longer side of an undistorted fisheye frame has at most."""
+_AGREES = 0.5
+"""Pixels within which a position has to come back when it is undistorted and distorted again."""
 
 
 @dataclass(frozen=True)
@@ -49,9 +58,9 @@ class Lens:
 
     @property
     def distorted(self) -> bool:
-        """Whether nerfstudio undistorts photos of this lens."""
+        """Whether photos of this lens are undistorted: all but those of a perspective lens without coefficients."""
         # In float32, as nerfstudio stores them.
-        return bool(np.any(np.asarray(self.distortion, dtype=np.float32)))
+        return self.model == "fisheye" or bool(np.any(np.asarray(self.distortion, dtype=np.float32)))
 
     @property
     def matrix(self) -> np.ndarray:
@@ -72,13 +81,14 @@ def undistorted_lens(lens: Lens) -> Lens:
     """The lens of the undistorted and cropped frame, as nerfstudio 1.1.5 computes it (`_undistort_image`).
 
     Perspective: `cv2.getOptimalNewCameraMatrix` with alpha 0, cropped to its region of interest. Fisheye:
-    `cv2.fisheye.estimateNewCameraMatrixForUndistortRectify` with balance 0, not cropped.
+    `cv2.fisheye.estimateNewCameraMatrixForUndistortRectify` with balance 0, not cropped; where that is wider than
+    `WIDEST`, so wide around the optical axis.
     """
     return _target(lens)[0]
 
 
 def undistort(image: np.ndarray, lens: Lens) -> np.ndarray:
-    """Warp an image from the raw to the undistorted frame, bilinearly, as nerfstudio warps photos.
+    """Warp an image from the raw to the undistorted frame, bilinearly.
 
     Warp an artifact's T and B = A W, not its straight color. Without distortion the image itself is returned.
 
@@ -128,6 +138,7 @@ def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
     pixels = pixels.astype(np.float64)
     if lens.model == "fisheye":
         rays = cv2.fisheye.undistortPoints(pixels, lens.matrix, lens.coefficients, np.eye(3), matrix)
+        rays[~_comes_back(rays, pixels, lens, matrix)] = -2  # outside
     else:
         precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-6)
         rays = cv2.undistortPointsIter(pixels, lens.matrix, lens.coefficients, np.eye(3), matrix, precise)
@@ -135,6 +146,14 @@ def distort(image: np.ndarray, lens: Lens, fill: float) -> np.ndarray:
     border = {"borderMode": cv2.BORDER_CONSTANT, "borderValue": (fill,) * 4}
     warped = cv2.remap(image, positions, None, interpolation=cv2.INTER_LINEAR, **border)  # type: ignore[call-overload]
     return _with_channels(warped, image)
+
+
+def _comes_back(rays: np.ndarray, pixels: np.ndarray, lens: Lens, matrix: np.ndarray) -> np.ndarray:
+    """Whether undistorted positions [N, 1, 2] are those of the pixels [N, 1, 2]: OpenCV mirrors those beyond 90 degrees
+    and stops short of some others. bool [N]."""
+    ahead = (rays - matrix[:2, 2]) / np.diag(matrix)[:2]
+    again = cv2.fisheye.distortPoints(ahead, lens.matrix, lens.coefficients)
+    return (np.abs(again - pixels) < _AGREES).all(axis=(1, 2))
 
 
 @lru_cache(maxsize=256)
@@ -147,6 +166,10 @@ def _target(lens: Lens) -> tuple[Lens, np.ndarray, tuple[int, int]]:
         matrix = cv2.fisheye.estimateNewCameraMatrixForUndistortRectify(
             lens.matrix, lens.coefficients, (width, height), np.eye(3), balance=0
         )
+        narrowest = max(width, height) / 2 / np.tan(np.radians(WIDEST) / 2)
+        if matrix[0, 0] < narrowest:
+            middle = [(width - 1) / 2, (height - 1) / 2, 1]
+            matrix = np.array([[narrowest, 0, 0], [0, narrowest * lens.fy / lens.fx, 0], middle]).T
     else:
         matrix, (x, y, width, height) = cv2.getOptimalNewCameraMatrix(
             lens.matrix, lens.coefficients, (width, height), 0

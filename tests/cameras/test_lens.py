@@ -35,11 +35,19 @@ def by_nerfstudio(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray
     return matrix, warped
 
 
+def narrowest(lens: Lens) -> float:
+    """Focal length of a frame whose longer side is 120 degrees wide."""
+    return max(lens.width, lens.height) / 2 / np.tan(np.radians(60))
+
+
 def check_against_nerfstudio(image: np.ndarray, lens: Lens) -> None:
     matrix, warped = by_nerfstudio(image, lens)
     if not np.isfinite(matrix).all() or not warped.size:
         with pytest.raises(ValueError, match=r"folds its frame|leaves no pixel"):
             undistort(image, lens)
+        return
+    if lens.model == "fisheye" and matrix[0, 0] < narrowest(lens):
+        assert undistorted_lens(lens).fx == pytest.approx(narrowest(lens))
         return
     ours, target = undistort(image, lens), undistorted_lens(lens)
     assert np.array_equal(ours, warped)
@@ -87,6 +95,58 @@ def test_a_fisheye_that_folds_its_frame_is_refused():
     lens = Lens(30, 30, 15.0, 14.55, 15.0, 15.0, (0.0, -0.125, 0.0, 0.0, 0.0, 0.0), "fisheye")
     with pytest.raises(ValueError, match="folds its frame"):
         undistorted_lens(lens)
+
+
+FISHEYES = {
+    "ideal, 180 degrees": (64 / (np.pi / 2), 0.0),
+    "ideal, 90 degrees": (64 / (np.pi / 4), 0.0),
+    "195 degrees": (34.0, 0.02),
+    "200 degrees, compressed at the rim": (42.0, -0.05),
+}
+
+
+def directions(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Angle from the axis, and direction [H, W, 3], of each pixel of a fisheye with k1 alone, from its definition."""
+    y, x = np.mgrid[: lens.height, : lens.width] + 0.5
+    x, y = (x - lens.cx) / lens.fx, (y - lens.cy) / lens.fy
+    radius, k1 = np.hypot(x, y), lens.distortion[0]
+    grid = np.linspace(0, np.pi, 20001)
+    grid = grid[: int(np.argmax(np.diff(grid + k1 * grid**3) <= 0)) or len(grid)]
+    theta = np.interp(radius, grid + k1 * grid**3, grid, right=np.pi)
+    scale = np.sin(theta) / radius
+    return theta, np.stack([x * scale, y * scale, np.cos(theta)], axis=-1).astype(np.float32)
+
+
+@pytest.mark.parametrize("name", FISHEYES)
+def test_undistorted_fisheyes_are_perspective_photos_of_at_most_120_degrees(name):
+    """Photos whose colors are their directions; nerfstudio takes ideal ones for perspective photos as they are."""
+    focal, k1 = FISHEYES[name]
+    lens = Lens(128, 128, focal, focal, 64, 64, (k1, 0, 0, 0, 0, 0), "fisheye")
+    target = undistorted_lens(lens)
+    seen = undistort(directions(lens)[1], lens)
+    y, x = np.mgrid[: target.height, : target.width] + 0.5
+    rays = np.stack([(x - target.cx) / target.fx, (y - target.cy) / target.fy, np.ones_like(x)], axis=-1)
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    assert np.abs(seen - rays)[2:-2, 2:-2].max() < 0.02
+    assert target.fx >= narrowest(lens) * (1 - 1e-9)
+    assert target.model == "perspective"
+    assert not target.distorted
+
+
+@pytest.mark.parametrize("name", FISHEYES)
+def test_what_lies_beyond_the_undistorted_frame_is_not_known(name):
+    """Beyond 90 degrees as well, where OpenCV mirrors positions."""
+    focal, k1 = FISHEYES[name]
+    lens = Lens(128, 128, focal, focal, 64, 64, (k1, 0, 0, 0, 0, 0), "fisheye")
+    target = undistorted_lens(lens)
+    known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > 0.999
+    x, y, z = np.moveaxis(directions(lens)[1], -1, 0)
+    with np.errstate(divide="ignore"):
+        across, down = np.abs(x / z) * target.fx, np.abs(y / z) * target.fy
+    inside = (z > 0) & (across < 61) & (down < 61)
+    outside = (z <= 0) | (across > 66) | (down > 66)
+    assert known[inside].all()
+    assert not known[outside].any()
 
 
 def test_without_distortion_the_image_is_returned():
