@@ -28,3 +28,7 @@ class InputError(SSAError, ValueError):
 
 class TrainingError(SSAError, RuntimeError):
     """A training with valid input that cannot continue. Exit code 3 of a command."""
+
+
+class TrainingStopped(SSAError):
+    """A training that its user stopped by ctrl+c. Exit code 130 of a command."""

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
+from typing import TYPE_CHECKING
 
-from ssa_nerfstudio.errors import SSAError, TrainingError
+from ssa_nerfstudio.errors import InputError, SSAError, TrainingError, TrainingStopped
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 INPUT_EXIT_CODE = 2
 """Of a command whose input cannot be used."""
@@ -15,8 +20,30 @@ INTERRUPTED_EXIT_CODE = 130
 """Of a command that ctrl+c ended, as shells have it."""
 
 
+BROKEN_PIPE_EXIT_CODE = 141
+"""Of a command whose output nobody reads any more, as shells have it."""
+
+
+def plain_console() -> Console:
+    """A console for text that holds paths: `[x]` is no markup and `:x:` no emoji, and lines are not wrapped."""
+    from rich.console import Console  # not before ctrl+c is handled
+
+    return Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+
+
+def refusal(error: OSError) -> InputError | None:
+    """What an error of the operating system says to a user: which file, and why. None where it does not say why."""
+    if not error.strerror:
+        return None
+    name = os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes)) else "the system refused a file"
+    return InputError(f"{name}: {error.strerror}", "check the path, its permissions and the room on its disk")
+
+
 def print_error(error: SSAError) -> int:
     """Print one line and return the exit code that the command ends with."""
+    if isinstance(error, TrainingStopped):
+        _print_line("stopped", str(error))
+        return INTERRUPTED_EXIT_CODE
     _print_line("error", str(error))
     return TRAINING_EXIT_CODE if isinstance(error, TrainingError) else INPUT_EXIT_CODE
 
@@ -34,4 +61,5 @@ class _OneLineHandler(logging.Handler):
 
 
 def _print_line(kind: str, message: str) -> None:
-    print(f"ssa-nerfstudio: {kind}: {' '.join(message.split())}", file=sys.stderr, flush=True)
+    line = f"ssa-nerfstudio: {kind}: {' '.join(message.split())}"
+    print(line.encode("utf-8", "backslashreplace").decode(), file=sys.stderr, flush=True)

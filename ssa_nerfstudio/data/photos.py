@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,14 +15,22 @@ HEIF_SUFFIXES = {".heic", ".heif"}
 """Suffixes of photos that need the package pillow-heif, in lower case."""
 UPRIGHT = 1
 """The EXIF orientation of a photo whose pixels are stored as they are shown."""
-_MODES = {"RGB", "L", "RGBA"}
+MAX_PIXELS = 500_000_000
+"""Of a photo. The largest cameras have 250 million; a file that states more is broken or hostile."""
 _COMPRESSION = 1
 """zlib's fastest: level 6 takes three times as long for files 13 % smaller."""
 
+# Pillow refuses photos of more than 179 million pixels by itself, also where nerfstudio opens them.
+Image.MAX_IMAGE_PIXELS = MAX_PIXELS
+
 
 @contextmanager
-def open_photo(path: Path) -> Iterator[Image.Image]:
+def open_photo(path: Path, modes: Collection[str] = ("RGB", "L", "RGBA")) -> Iterator[Image.Image]:
     """Open a photo without decoding it; errors of the block are those of the photo.
+
+    Args:
+        path: the file.
+        modes: Pillow's modes that are taken.
 
     Yields:
         The photo, of which only the header has been read.
@@ -35,8 +43,14 @@ def open_photo(path: Path) -> Iterator[Image.Image]:
         _register_heif(path)
     try:
         with Image.open(path) as image:
-            if image.mode not in _MODES:
-                raise InputError(f"{path} is of mode {image.mode}", "convert it to 8-bit RGB")
+            if image.mode not in modes:
+                kind = "RGB" if "RGB" in modes else "gray"
+                raise InputError(f"{path} is of mode {image.mode}", f"convert it to 8-bit {kind}")
+            if image.width * image.height > MAX_PIXELS:
+                raise InputError(
+                    f"{path} is {image.width} x {image.height}, more than {MAX_PIXELS / 1e6:.0f} megapixels",
+                    "reduce it",
+                )
             yield image
     except InputError:
         raise
@@ -86,11 +100,7 @@ def read_photo(
         InputError: see `open_photo`; or the size is another, or pixels are transparent.
     """
     image = load_photo(path, upright)
-    if size is not None and image.size != size:
-        raise InputError(
-            f"{path} is {image.width} x {image.height}, expected {size[0]} x {size[1]}",
-            "replace the photo, or correct w and h in transforms.json",
-        )
+    _check_size(path, image, size)
     if image.mode != "RGBA":
         return np.array(image.convert("RGB"))
     pixels = np.array(image)
@@ -99,6 +109,21 @@ def read_photo(
     if pixels[..., 3].min() < 255:
         raise InputError(f"{path} has transparent pixels", "convert it to 8-bit RGB")
     return np.ascontiguousarray(pixels[..., :3])
+
+
+def check_mask(path: Path, size: tuple[int, int]) -> None:
+    """Check that nerfstudio can read a mask: one channel, whose black is ignored, of its photo's size.
+
+    Args:
+        path: the file.
+        size: the photo's width and height, pixels.
+
+    Raises:
+        InputError: it is something else, or see `open_photo`.
+    """
+    with open_photo(path, modes=("L", "1")) as image:
+        image.load()
+    _check_size(path, image, size)
 
 
 def read_gray(path: Path) -> np.ndarray:
@@ -110,6 +135,14 @@ def read_gray(path: Path) -> np.ndarray:
     with open_photo(path) as image:
         image.draft("L", image.size)  # JPEG: the stored luma itself, which is also faster
         return np.array(image.convert("L"))
+
+
+def _check_size(path: Path, image: Image.Image, size: tuple[int, int] | None) -> None:
+    if size is not None and image.size != size:
+        raise InputError(
+            f"{path} is {image.width} x {image.height}, expected {size[0]} x {size[1]}",
+            "replace it, or correct w and h in transforms.json",
+        )
 
 
 def exif_orientation(image: Image.Image) -> int:

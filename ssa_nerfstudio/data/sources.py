@@ -6,9 +6,12 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
+from ssa_nerfstudio._system.natural_order import natural_order
+from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.photos import UPRIGHT, exif_orientation, open_photo
 from ssa_nerfstudio.data.video import Video
 from ssa_nerfstudio.errors import InputError
@@ -20,12 +23,21 @@ VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts"}
 _ON_THE_SIDE = {5, 6, 7, 8}
 
 
+class SourceCamera(NamedTuple):
+    """A camera of the dataset."""
+
+    name: str
+    """Prefix of its photos: NAME_00001.jpg."""
+    face: Face | None
+    """What it sees of equirectangular photos."""
+
+
 @dataclass(frozen=True)
 class Source:
     """The photos or videos of one pass: one camera, one frame size, one orientation."""
 
     name: str
-    """Prefix of the dataset's photos of this pass: NAME_00001.jpg."""
+    """What the dataset calls this pass."""
     path: Path
     """The folder or video, as the user gave it."""
     photos: tuple[Path, ...]
@@ -40,6 +52,20 @@ class Source:
     """EXIF orientation of all photos, 1 to 8."""
     skipped_videos: tuple[Path, ...] = ()
     """Videos beside photos: phones store moving copies of photos."""
+    faces: tuple[Face, ...] = ()
+    """Perspective faces to cut out of equirectangular photos; empty for those of any other kind."""
+
+    @property
+    def cameras(self) -> list[SourceCamera]:
+        """The dataset's cameras: one for each face, or the one that took the photos."""
+        if not self.faces:
+            return [SourceCamera(self.name, None)]
+        return [SourceCamera(f"{self.name}_{face.name}", face) for face in self.faces]
+
+    @property
+    def longest_side(self) -> int:
+        """Of the dataset's photos, pixels."""
+        return self.faces[0].size if self.faces else max(self.width, self.height)
 
     def video_frames(self, count: int) -> Iterator[tuple[Video, int, np.ndarray]]:
         """Sharp frames of all videos in order, from each as many as its share of all frames.
@@ -61,6 +87,40 @@ class Source:
         return [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
 
 
+def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
+    """Find the photos or videos of one pass, a source for each camera that took them.
+
+    A folder without photos and videos of its own is a rig's: each of its subfolders is a camera and names it. Photos of
+    several sizes or EXIF orientations in one folder are those of `camera_1`, `camera_2`, ...: an artifact has its place
+    in photos of one orientation.
+
+    Args:
+        path: a folder of photos or of videos, a folder of such folders, or one video.
+        name: what the dataset calls the only camera.
+        min_photos: how many photos are needed of each camera, at least 1.
+
+    Raises:
+        InputError: as `read_source`, but for sizes and orientations that enough photos have.
+    """
+    if path.is_dir() and not any(_media(path)):
+        folders = [folder for folder in sorted(path.iterdir(), key=_by_name) if _is_camera(folder)]
+        if folders:
+            sources = [read_source(folder, re.sub(r"[^\w.-]", "_", folder.name), min_photos) for folder in folders]
+            for number, source in enumerate(sources):
+                if source.name in {other.name for other in sources[:number]}:
+                    raise InputError(f"{source.path} has the name of another camera", "rename it")
+            return sources
+    photos, videos = _media(path)
+    if path.is_dir() and photos:
+        groups = _by_frame(photos)
+        if len(groups) > 1 and min(map(len, groups.values())) >= min_photos:
+            return [
+                _of_photos(f"camera_{number}", path, group, frame, videos if number == 1 else [])
+                for number, (frame, group) in enumerate(groups.items(), 1)
+            ]
+    return [read_source(path, name, min_photos)]
+
+
 def read_source(path: Path, name: str, min_photos: int) -> Source:
     """Find the photos or videos of one pass and check that one camera can have taken them all.
 
@@ -76,41 +136,61 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
     """
     if not path.exists():
         raise InputError(f"{path} does not exist", "give a folder of photos, a folder of videos or a video")
-    files = [path] if path.is_file() else sorted(path.iterdir(), key=_natural)
-    files = [file for file in files if file.is_file() and not file.name.startswith(".")]
-    photos = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES and path.is_dir()]
-    videos = [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
-    if photos:
-        return _photos(path, name, min_photos, photos, videos)
-    if videos:
+    photos, videos = _media(path)
+    if not photos and not videos:
+        known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
+        raise InputError(f"{path} holds no photo and no video ({known})", "put them there or name another folder")
+    if not photos:
         return _videos(path, name, videos)
-    known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
-    raise InputError(f"{path} holds no photo and no video ({known})", "put them there or name another folder")
-
-
-def _photos(path: Path, name: str, min_photos: int, photos: list[Path], videos: list[Path]) -> Source:
     if len(photos) < min_photos:
         raise InputError(
             f"{path} holds {len(photos)} photo{'s'[: len(photos) > 1]}, {min_photos} are needed", "add more"
         )
-    first: tuple[tuple[int, int], int] | None = None
-    for photo in photos:
-        with open_photo(photo) as image:
-            size, orientation = image.size, exif_orientation(image)
-        first = first or (size, orientation)
-        if orientation != first[1]:
+    groups = _by_frame(photos)
+    (size, orientation), *others = groups
+    for other in others:
+        photo = groups[other][0]
+        if other[1] != orientation:
             raise InputError(
-                f"{photo} has EXIF orientation {orientation}, {photos[0].name} has {first[1]}: a static artifact "
+                f"{photo} has EXIF orientation {other[1]}, {photos[0].name} has {orientation}: a static artifact "
                 "has one place in photos of one orientation",
                 "process one of them, or remove the tag from all photos",
             )
-        if size != first[0]:
-            raise InputError(
-                f"{photo} is {size[0]} x {size[1]}, {photos[0].name} is {first[0][0]} x {first[0][1]}",
-                "use one folder for each camera and orientation",
-            )
-    assert first is not None
-    (width, height), orientation = first
+        raise InputError(
+            f"{photo} is {other[0][0]} x {other[0][1]}, {photos[0].name} is {size[0]} x {size[1]}",
+            "use one folder for each camera and orientation",
+        )
+    return _of_photos(name, path, photos, (size, orientation), videos)
+
+
+_Frame = tuple[tuple[int, int], int]
+"""Width and height of a photo's pixels, and its EXIF orientation."""
+
+
+def _media(path: Path) -> tuple[list[Path], list[Path]]:
+    """Photos and videos in a folder, or a video itself, in natural order."""
+    if not path.exists():
+        return [], []
+    files = [path] if path.is_file() else sorted(path.iterdir(), key=_by_name)
+    files = [file for file in files if file.is_file() and not file.name.startswith(".")]
+    photos = [file for file in files if file.suffix.lower() in PHOTO_SUFFIXES and path.is_dir()]
+    return photos, [file for file in files if file.suffix.lower() in VIDEO_SUFFIXES]
+
+
+def _is_camera(path: Path) -> bool:
+    return path.is_dir() and not path.name.startswith(".") and any(_media(path))
+
+
+def _by_frame(photos: list[Path]) -> dict[_Frame, list[Path]]:
+    groups: dict[_Frame, list[Path]] = {}
+    for photo in photos:
+        with open_photo(photo) as image:
+            groups.setdefault((image.size, exif_orientation(image)), []).append(photo)
+    return groups
+
+
+def _of_photos(name: str, path: Path, photos: list[Path], frame: _Frame, videos: list[Path]) -> Source:
+    (width, height), orientation = frame
     if orientation in _ON_THE_SIDE:
         width, height = height, width
     return Source(name, path, tuple(photos), (), width, height, orientation, tuple(videos))
@@ -128,7 +208,5 @@ def _videos(path: Path, name: str, files: list[Path]) -> Source:
     return Source(name, path, (), tuple(videos), first.width, first.height)
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key that puts frame_9 before frame_10."""
-    parts = re.split(r"(\d+)", path.name)
-    return [(int(part), part) if part.isdecimal() else (-1, part) for part in parts]
+def _by_name(path: Path) -> list[tuple[int, str]]:
+    return natural_order(path.name)

@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from ssa_nerfstudio.data.transforms import FILE_KEYS, SPLITS, Split, Transforms, is_file
+from ssa_nerfstudio.cameras.lens import undistorted_lens
+from ssa_nerfstudio.data.sparse_points import check_points
+from ssa_nerfstudio.data.transforms import FILE_KEYS, OTHER_MODELS, SPLITS, Split, Transforms, is_file
 from ssa_nerfstudio.errors import InputError
 
 MIN_VIEWS = 2
 """A static artifact is what does not change between views, so one view cannot show it."""
+_ROTATION_TOLERANCE = 0.01
+"""Largest deviation of R R^T from the identity: poses of real captures have a few digits."""
 _ORIENTATION_METHODS = ("none", "pca", "up", "vertical")
 
 
@@ -39,12 +43,23 @@ def check_training(
     _check_alignment(transforms)
     _check_lenses(transforms)
     _check_files(transforms, downscale_factor)
-    if any(transforms.stated_split(split) is not None for split in SPLITS):
-        for split in splits:
-            if transforms.stated_split(split) is None:
-                raise InputError(
-                    f"{path} states a split without {split}_filenames", "add that list, or remove the others"
-                )
+    _check_split(transforms, splits)
+
+
+def _check_split(transforms: Transforms, needed: Iterable[Split]) -> None:
+    stated = {split: transforms.stated_split(split) for split in SPLITS}
+    if all(names is None for names in stated.values()):
+        return
+    for split in needed:
+        if stated[split] is None:
+            raise InputError(
+                f"{transforms.path} states a split without {split}_filenames", "add that list, or remove the others"
+            )
+    if len(stated["train"] or ()) < MIN_VIEWS:
+        raise InputError(
+            f"{transforms.path}: train_filenames leaves {len(stated['train'] or ())} photos to train on",
+            f"list at least {MIN_VIEWS}",
+        )
 
 
 def _check_poses(transforms: Transforms) -> None:
@@ -54,6 +69,15 @@ def _check_poses(transforms: Transforms) -> None:
         if pose is None or pose.shape != (4, 4):
             raise InputError(
                 f"{transforms.path}: the pose of {frame['file_path']} is no 4 x 4 matrix of finite numbers",
+                "correct it, or remove that frame",
+            )
+        turn = pose[:3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            rigid = np.abs(turn @ turn.T - np.eye(3)).max() < _ROTATION_TOLERANCE and np.linalg.det(turn) > 0
+        if not rigid:
+            raise InputError(
+                f"{transforms.path}: the pose of {frame['file_path']} is no rotation with a position: its axes are not "
+                "three right-handed unit vectors",
                 "correct it, or remove that frame",
             )
         positions.append(pose[:3, 3])
@@ -77,27 +101,38 @@ def _check_alignment(transforms: Transforms) -> None:
     if meta.get("orientation_override", "none") not in _ORIENTATION_METHODS:
         names = ", ".join(_ORIENTATION_METHODS)
         raise InputError(f"{path}: orientation_override must be one of {names}", "correct or remove it")
-    if not isinstance(meta.get("ply_file_path", ""), str):
-        raise InputError(f"{path}: ply_file_path is no file path", "correct or remove it")
 
 
 def _check_lenses(transforms: Transforms) -> None:
     if transforms.camera_model == "FISHEYE624":
         return  # nerfstudio undistorts it by itself
+    if transforms.camera_model in OTHER_MODELS:
+        raise InputError(
+            f"{transforms.path}: splatfacto draws no camera_model {transforms.camera_model}",
+            "cut perspective photos out of these",
+        )
     for frame in transforms.frames:
         try:
-            transforms.lens(frame)
+            undistorted_lens(transforms.lens(frame))
         except ValueError as error:
             raise InputError(
                 f"{transforms.path}: camera of {frame['file_path']}: {error}", "process the photos again"
             ) from error
 
 
+def check_seed_points(transforms: Transforms) -> None:
+    """Check the sparse points that a training starts from, where transforms.json states a file of them.
+
+    Raises:
+        InputError: see `sparse_points.check_points`.
+    """
+    if "ply_file_path" in transforms.meta:
+        check_points(transforms.root / transforms.meta["ply_file_path"])
+
+
 def _check_files(transforms: Transforms, downscale_factor: int | None) -> None:
     for key, kind in FILE_KEYS.items():
         names = [frame[key] for frame in transforms.frames if key in frame]
-        if not all(isinstance(name, str) for name in names):
-            raise InputError(f"{transforms.path}: a {key} is no file path", "correct or remove it")
         if 0 < len(names) < len(transforms.frames):
             raise InputError(
                 f"{transforms.path}: {len(names)} of {len(transforms.frames)} frames have a {key}",

@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ssa_nerfstudio.cameras.lens import Lens
+from ssa_nerfstudio.data.photos import MAX_PIXELS
 from ssa_nerfstudio.errors import InputError
 
 Kind = Literal["images", "masks", "depths"]
@@ -38,7 +39,6 @@ OTHER_MODELS = {
 """The rest of what nerfstudio knows. Splatfacto cannot undistort most of them."""
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _MAX_FLOAT32 = float(np.finfo(np.float32).max)
-_MAX_SIZE = 2**31 - 1
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,7 @@ class Transforms:
             raise InputError(f"{path} is no valid JSON ({error})", "write it again with ns-process-data") from error
         result = cls(path, meta)
         result._check_frames()
+        result._make_relative()
         result._check_cameras()
         return result
 
@@ -103,6 +104,14 @@ class Transforms:
         """Which lens model the intrinsics are of; one for all frames."""
         return self.meta.get("camera_model", "OPENCV")
 
+    @property
+    def test_photos_are_clean(self) -> bool:
+        """Whether the file states a test split, whose photos are then free of the artifact.
+
+        Without one, nerfstudio holds back some of the photos, which have the artifact, too.
+        """
+        return self.stated_split("test") is not None
+
     def intrinsics(self, frame: dict[str, Any]) -> Intrinsics:
         """Intrinsics of one frame; what the file states for all frames takes precedence, as in nerfstudio.
 
@@ -113,21 +122,25 @@ class Transforms:
         def value(key: str) -> float:
             if key not in self.meta and key not in frame:
                 raise ValueError(f"{key} is missing")
-            return float(self.meta[key] if key in self.meta else frame[key])
+            return _number(key, self.meta[key] if key in self.meta else frame[key])
 
         # nerfstudio takes all of the distortion from one place, and does not look for k4 to find it.
         stated = {*_DISTORTION, "distortion_params"} - {"k4"}
         holder = self.meta if stated & self.meta.keys() else frame
-        distortion = tuple(holder.get("distortion_params") or (holder.get(key, 0.0) for key in _DISTORTION))
+        distortion = holder.get("distortion_params") or [holder.get(key, 0.0) for key in _DISTORTION]
+        if not isinstance(distortion, list):
+            raise ValueError(f"distortion_params must be a list, got {distortion!r:.40}")
         numbers = {key: value(key) for key in ("w", "h", "fl_x", "fl_y", "cx", "cy")}
-        coefficients = tuple(float(number) for number in distortion)
+        coefficients = tuple(_number("distortion", number) for number in distortion)
         for key, number in [*numbers.items(), *(("distortion", number) for number in coefficients)]:
             if not abs(number) <= _MAX_FLOAT32:
                 raise ValueError(f"intrinsics must be finite, {key} is {number}")
         width, height, fx, fy, cx, cy = numbers.values()
-        if not (1 <= width <= _MAX_SIZE and 1 <= height <= _MAX_SIZE):
+        if min(width, height) < 1:
             raise ValueError(f"frame must be at least 1 x 1 pixels, got {width:g} x {height:g}")
-        if fx <= 0 or fy <= 0:
+        if width * height > MAX_PIXELS:
+            raise ValueError(f"{width:.0f} x {height:.0f} are more than {MAX_PIXELS / 1e6:.0f} megapixels")
+        if not min(np.float32(fx), np.float32(fy)) > 0:  # as nerfstudio reads them
             raise ValueError(f"focal lengths must be positive, got {fx:g} and {fy:g}")
         return Intrinsics(int(width), int(height), fx, fy, cx, cy, coefficients)
 
@@ -191,7 +204,7 @@ class Transforms:
                 what = "mask" if kind == "masks" else "photo"
                 raise InputError(f"{path} does not exist", f"put the {what} there or remove its frame")
 
-    def check_copyable(self, others: Iterable[object] = ()) -> None:
+    def check_copyable(self, others: Iterable[str] = ()) -> None:
         """Check what a copy of the dataset needs beyond training: each frame once, and all files inside the folder.
 
         Args:
@@ -206,8 +219,6 @@ class Transforms:
                 raise InputError(f"{self.path} has two frames of {photo}", "remove one")
             seen.add(photo)
         for name in [*(frame[key] for frame in self.frames for key in FILE_KEYS if key in frame), *others]:
-            if not isinstance(name, str):
-                raise InputError(f"{self.path}: {name!r} is no file path", "correct or remove it")
             if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
                 raise InputError(
                     f"{self.path}: {name} lies outside the dataset", "put it inside and state its relative path"
@@ -221,6 +232,27 @@ class Transforms:
         for frame in frames:
             if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
                 raise InputError(f"{problem}: the frame {frame!r:.100} is no such object", "correct or remove it")
+        stated = [(key, frame[key]) for frame in frames for key in FILE_KEYS if key in frame]
+        for key, name in [*stated, ("ply_file_path", self.meta.get("ply_file_path", ""))]:
+            if not isinstance(name, str):
+                raise InputError(f"{self.path}: {key} {name!r:.40} is no file path", "correct or remove it")
+
+    def _make_relative(self) -> None:
+        """Take absolute paths inside the dataset, which some programs write, for relative ones."""
+        roots = self.root.absolute(), self.root.resolve()
+
+        def relative(name: object) -> object:
+            if not isinstance(name, str) or not name.startswith(tuple(f"{root}/" for root in roots)):
+                return name
+            return next(str(PurePosixPath(name).relative_to(root)) for root in roots if name.startswith(f"{root}/"))
+
+        keys = [(self.meta, "ply_file_path"), *((frame, key) for frame in self.frames for key in FILE_KEYS)]
+        for holder, key in keys:
+            if key in holder:
+                holder[key] = relative(holder[key])
+        for key in (f"{split}_filenames" for split in SPLITS):
+            if isinstance(self.meta.get(key), list):
+                self.meta[key] = [relative(name) for name in self.meta[key]]
 
     def _check_cameras(self) -> None:
         known = PERSPECTIVE_MODELS | FISHEYE_MODELS | OTHER_MODELS
@@ -232,10 +264,17 @@ class Transforms:
         for frame in self.frames:
             try:
                 self.intrinsics(frame)
-            except (TypeError, ValueError) as error:
+            except ValueError as error:
                 raise InputError(
                     f"{self.path}: camera of {frame['file_path']}: {error}", "correct it or process the photos again"
                 ) from error
+
+
+def _number(key: str, value: Any) -> float:
+    try:
+        return float(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{key} is no number: {value!r:.40}") from error
 
 
 def is_file(path: Path) -> bool:

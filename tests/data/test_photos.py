@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import ExifTags, Image
 
-from ssa_nerfstudio.data.photos import load_photo, read_gray, read_photo, write_photo
+from ssa_nerfstudio.data.photos import check_mask, load_photo, open_photo, read_gray, read_photo, write_photo
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.datamanager import PhotoDataset
 
@@ -102,3 +104,38 @@ def test_nerfstudios_dataset_gives_the_same_pixels(mode, scale, suffix, tmp_path
     outputs = SimpleNamespace(image_filenames=[path], cameras=cameras, scene_box=None, metadata={}, alpha_color=None)
     ours, theirs = (dataset(outputs, scale) for dataset in (PhotoDataset, InputDataset))  # pyright: ignore[reportArgumentType]
     np.testing.assert_array_equal(ours.get_numpy_image(0), theirs.get_numpy_image(0))
+
+
+def stated_as(path: Path, width: int, height: int) -> Path:
+    """A PNG whose header states another size than its pixels have."""
+    content = bytearray(save(path).read_bytes())
+    content[16:24] = struct.pack(">II", width, height)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    path.write_bytes(content)
+    return path
+
+
+def test_the_largest_photos_of_real_cameras_are_photos(tmp_path, recwarn):
+    with open_photo(stated_as(tmp_path / "a.png", 20_000, 12_000)) as image:
+        assert image.size == (20_000, 12_000)
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize(("width", "height"), [(25_000, 20_001), (100_000, 100_000), (2**31 - 1, 1), (2**31 - 1,) * 2])
+def test_photos_beyond_every_camera_are_refused_before_they_are_decoded(width, height, tmp_path):
+    path = stated_as(tmp_path / "a.png", width, height)
+    with pytest.raises(InputError, match=r"more than 500 megapixels|exceeds limit"):
+        read_photo(path)
+
+
+@pytest.mark.parametrize(("mode", "complaint"), [("RGB", "mode RGB"), ("P", "mode P"), ("RGBA", "mode RGBA")])
+def test_masks_of_several_channels_are_named(mode, complaint, tmp_path):
+    with pytest.raises(InputError, match=rf"a.png is of {complaint}; convert it to 8-bit gray"):
+        check_mask(save(tmp_path / "a.png", mode), (WIDTH, HEIGHT))
+
+
+def test_masks_of_one_channel_and_the_photos_size_are_taken(tmp_path):
+    for mode in ("L", "1"):
+        check_mask(save(tmp_path / "a.png", mode), (WIDTH, HEIGHT))
+    with pytest.raises(InputError, match=r"a\.png is 37 x 23, expected 5 x 4"):
+        check_mask(tmp_path / "a.png", (5, 4))

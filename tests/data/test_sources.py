@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from ssa_nerfstudio.data.sources import read_source
+from ssa_nerfstudio.data.sources import read_source, read_sources
 from ssa_nerfstudio.errors import InputError
 
 
@@ -72,3 +72,38 @@ def test_what_one_camera_cannot_have_taken_is_refused(tmp_path):
     Image.new("RGB", (48, 64)).save(tmp_path / "2.png")
     with pytest.raises(InputError, match=r"2.png is 48 x 64, 0.png is 64 x 48; use one folder for each camera"):
         read_source(tmp_path, "frame", min_photos=3)
+
+
+def test_each_subfolder_of_a_rig_is_a_camera(tmp_path):
+    for camera, count in (("side 2", 3), ("front", 4)):
+        touch_photos(tmp_path / camera, *(f"{number}.png" for number in range(count)))
+    (tmp_path / "notes").mkdir()
+    (tmp_path / ".cache").mkdir()
+    touch_photos(tmp_path / ".cache", "0.png")
+    sources = read_sources(tmp_path, "frame", min_photos=3)
+    assert [(source.name, len(source.photos)) for source in sources] == [("front", 4), ("side_2", 3)]
+    touch_photos(tmp_path / "side_2", "0.png", "1.png", "2.png")
+    with pytest.raises(InputError, match="has the name of another camera"):
+        read_sources(tmp_path, "frame", min_photos=3)
+
+
+def test_photos_in_portrait_and_landscape_are_two_cameras(tmp_path):
+    touch_photos(tmp_path, *(f"{number}.png" for number in range(4)))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for number in range(4, 7):
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{number}.png", exif=exif)
+    landscape, portrait = read_sources(tmp_path, "frame", min_photos=3)
+    assert [path.name for path in portrait.photos] == ["4.png", "5.png", "6.png"]
+    assert (landscape.name, landscape.width, landscape.height) == ("camera_1", 64, 48)
+    assert (portrait.name, portrait.width, portrait.height, portrait.orientation) == ("camera_2", 48, 64, 6)
+    (tmp_path / "6.png").unlink()
+    with pytest.raises(InputError, match=r"4.png has EXIF orientation 6, 0.png has 1"):
+        read_sources(tmp_path, "frame", min_photos=3)
+
+
+def test_the_photos_of_one_camera_are_one_source(tmp_path):
+    touch_photos(tmp_path, "0.png", "1.png", "2.png")
+    (tmp_path / "thumbnails").mkdir()
+    touch_photos(tmp_path / "thumbnails", "0.png")
+    assert read_sources(tmp_path, "frame", 3) == [read_source(tmp_path, "frame", 3)]

@@ -67,7 +67,6 @@ def test_camera_models_are_nerfstudios():
         lambda meta: meta["frames"][1].update(transform_matrix=[["1", "0", "0", "7"], *np.eye(4)[1:].tolist()]),
         lambda meta: meta.update(distortion_params=[0.01, 0, 0, 0, 0, 0]),
         lambda meta: meta.update(camera_model="OPENCV_FISHEYE", k1=0.01, k4=0.001),
-        lambda meta: meta.update(camera_model="EQUIRECTANGULAR"),
         in_frames("fl_x", [14.0, 15.0, "16", 17.0, 18.0]),
         in_frames("distortion_params", [[0.01 * number, 0, 0, 0, 0, 0] for number in range(5)]),
         in_frames("mask_path", [name.replace("images", "masks") for name in NAMES]),
@@ -132,14 +131,14 @@ def pose(row: list | None) -> Callable[[dict], object]:
         (lambda meta: meta.update(applied_transform=np.eye(4).tolist()), "applied_transform is no 3 x 4 matrix"),
         (lambda meta: meta.update(applied_scale="large"), "applied_scale is no finite number"),
         (lambda meta: meta.update(orientation_override="down"), "orientation_override must be one of none, pca, up"),
-        (lambda meta: meta.update(ply_file_path=3), "ply_file_path is no file path"),
+        (lambda meta: meta.update(ply_file_path=3), "ply_file_path 3 is no file path"),
         (lambda meta: meta.update(k1=0.01, k4=0.01), "nerfstudio undistorts no perspective camera with k4"),
-        (lambda meta: meta.update(camera_model="VR180_L", k1=0.01), "VR180_L with distortion cannot be used"),
+        (lambda meta: meta.update(camera_model="VR180_L", k1=0.01), "splatfacto draws no camera_model VR180_L"),
         (lambda meta: meta["frames"][4].update(file_path="images/9.png"), "images/9.png does not exist; put the photo"),
         (lambda meta: meta["frames"][4].update(file_path="x" * 300), "does not exist"),
         (lambda meta: meta["frames"][4].update(mask_path=NAMES[0]), "1 of 5 frames have a mask_path; state it in all"),
         (in_frames("mask_path", ["masks/9.png"] * 5), "masks/9.png does not exist; put the mask there"),
-        (in_frames("mask_path", [3] * 5), "a mask_path is no file path"),
+        (in_frames("mask_path", [3] * 5), "mask_path 3 is no file path"),
     ],
 )  # fmt: skip
 def test_what_training_cannot_use_is_named(edit, message, tmp_path):
@@ -158,3 +157,24 @@ def test_detection_and_simulation_need_no_poses_and_complete_the_split(tmp_path)
     dataset = Dataset.read(write(tmp_path / "data", edit), eval_interval=8)
     assert dataset.split == (NAMES[2:], NAMES[:2], NAMES[:2])
     assert [view.role for view in dataset.views] == ["test"] * 2 + ["train"] * 3
+
+
+def test_absolute_paths_inside_the_dataset_are_as_relative_ones(tmp_path):
+    """nerfstudio takes both, and some programs write them; everything else here goes on with relative ones."""
+    data = write(tmp_path / "capture")
+    path = data / "transforms.json"
+    relative = json.loads(path.read_text())
+    absolute = {**relative, "ply_file_path": str(data / "points.ply"), "test_filenames": [str(data / NAMES[0])]}
+    absolute["frames"] = [{**frame, "file_path": str(data / frame["file_path"])} for frame in relative["frames"]]
+    path.write_text(json.dumps(absolute))
+    read = Transforms.read(data)
+    read.check_copyable([read.meta["ply_file_path"]])
+    assert [frame["file_path"] for frame in read.frames] == [frame["file_path"] for frame in relative["frames"]]
+    assert read.stated_split("test") == [NAMES[0]]
+    read.check_exist(frame["file_path"] for frame in read.frames)
+
+
+def test_absolute_paths_elsewhere_stay_refused(tmp_path):
+    data = write(tmp_path / "capture", lambda meta: meta["frames"][0].update(file_path=str(tmp_path / "other.png")))
+    with pytest.raises(InputError, match="lies outside the dataset"):
+        Transforms.read(data).check_copyable()
