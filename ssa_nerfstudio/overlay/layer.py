@@ -38,9 +38,7 @@ class ScreenSpaceOverlay(nn.Module):
     """[4] int64: height, width, resolution, adds_light. On loading, a checkpoint gives the overlay's size by it, before
     any photo is opened."""
     evidence: Tensor
-    """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the views agree."""
-    near: Tensor
-    """[h, w, 1], 1 at pixels that learn from the first step, 0 at those that `hold_far_pixels` holds."""
+    """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the artifact was found."""
 
     def __init__(self, height: int, width: int, resolution: int = 1, adds_light: bool = False) -> None:
         """Create an overlay with constant color and matte.
@@ -57,49 +55,20 @@ class ScreenSpaceOverlay(nn.Module):
         self.alpha_logits = nn.Parameter(torch.full((*size, 1), alpha).logit())
         self.register_buffer("frame", torch.tensor([height, width, resolution, int(adds_light)]))
         self.register_buffer("evidence", torch.ones(*size, 1))
-        self.register_buffer("near", torch.ones(*size, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
-        self._held: list[tuple[Tensor, Tensor]] = []
 
     @torch.no_grad()
-    def initialize(self, color: Tensor, alpha: Tensor, evidence: Tensor, near: Tensor) -> None:
+    def initialize(self, color: Tensor, alpha: Tensor, evidence: Tensor) -> None:
         """Set the parameters and buffers; color and matte are clamped so that their logits are finite.
 
         Args:
             color: W, straight color or additive light, [h, w, 3] in [0, 1].
             alpha: A, [h, w, 1] in [0, 1].
             evidence: r, [h, w, 1] in [0, 1], weight of the sparsity loss.
-            near: [h, w, 1] bool, pixels that learn from the first step.
         """
         self.color_logits.copy_(color.clamp(*INITIAL_COLOR_RANGE).logit())
         self.alpha_logits.copy_(alpha.clamp(*INITIAL_MATTE_RANGE).logit())
         self.evidence.copy_(evidence)
-        self.near.copy_(near)
-
-    @torch.no_grad()
-    def hold_far_pixels(self, active: bool) -> None:
-        """Hold, or release, the pixels far from static edges; call it before every optimizer step.
-
-        Early in a training an overlay explains anything constant (the sky ahead of a walk) sooner than Gaussians can.
-        Once the scene has learned it, the overlay has nothing to gain there.
-
-        Args:
-            active: the first call with True remembers the parameters that `restore_held` restores; False releases them.
-        """
-        if not active:
-            self._held = []
-        elif not self._held:
-            self._held = [(p.clone(), (self.near > 0).expand_as(p)) for p in self.parameters()]
-
-    @torch.no_grad()
-    def restore_held(self) -> None:
-        """Undo an optimizer step at the pixels that are held.
-
-        Zero gradients would not do: Adam's second moment would be zero on release, and its first steps six times too
-        large.
-        """
-        for parameter, (held, near) in zip(self.parameters(), self._held, strict=False):
-            torch.where(near, parameter, held, out=parameter)
 
     @torch.no_grad()
     def clamp_logits(self) -> None:

@@ -85,10 +85,16 @@ def premultiply(color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
     return 1.0 - alpha, alpha * color
 
 
+def smallest_matte(transmittance: Tensor, addition: Tensor) -> Tensor:
+    """The smallest matte [..., 1] in [0, 1] that carries layers: one minus the mean T, and at least B."""
+    hidden = 1.0 - transmittance.mean(dim=-1, keepdim=True)
+    return torch.maximum(hidden, addition.amax(dim=-1, keepdim=True)).clamp_max(1.0)
+
+
 def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Tensor]:
     """Convert layers to straight color and matte, the inverse of `premultiply`.
 
-    Additive light has no straight color: it gets the smallest matte that can carry it, at most 1.
+    Additive light has no straight color: it gets the smallest matte that can carry it.
 
     Args:
         transmittance: T [..., 1] or [..., 3] in [0, 1]; the matte is one minus its mean.
@@ -97,6 +103,5 @@ def straight_color(transmittance: Tensor, addition: Tensor) -> tuple[Tensor, Ten
     Returns:
         Color [..., 3] in [0, 1], black where the matte is zero, and matte [..., 1] in [0, 1].
     """
-    alpha = torch.maximum(1.0 - transmittance.mean(dim=-1, keepdim=True), addition.amax(dim=-1, keepdim=True))
-    alpha = alpha.clamp_max(1.0)
+    alpha = smallest_matte(transmittance, addition)
     return (addition / alpha.clamp_min(1e-6)).clamp(0.0, 1.0), alpha

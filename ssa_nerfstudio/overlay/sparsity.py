@@ -14,18 +14,18 @@ Sparsity = Literal["l1", "log", "off"]
 LOG_SOFTNESS = 0.1
 """e of the concave penalty log(1 + A / e): like l1 below this opacity, lenient on opaque pixels above it."""
 LOG_EVIDENCE_FLOOR = 0.1
-"""Share of the concave penalty that a pixel pays even where all views have the same color."""
+"""Share of the concave penalty that a pixel pays even where the artifact is known."""
 
 
 def sparsity_loss(matte: Tensor, evidence: Tensor, kind: Sparsity) -> Tensor:
     """Penalize the matte.
 
     `l1` is the paper's mean_u A(u). `log` is mean_u (0.1 + 0.9 r(u)) log(1 + A / e) / log(1 + 1 / e) with e = 0.1: it
-    penalizes a faint, wide matte (an exposure layer) most, and opaque pixels and pixels whose views agree least.
+    penalizes a faint, wide matte (an exposure layer) most, and what is opaque, or was found before, least.
 
     Args:
         matte: A [h, w, 1] in [0, 1].
-        evidence: r [h, w, 1] in [0, 1], small where the views agree (`ScreenSpaceOverlay.evidence`).
+        evidence: r [h, w, 1] in [0, 1], small where the artifact was found (`ScreenSpaceOverlay.evidence`).
         kind: `l1`, `log`, or `off`, which is zero.
 
     Returns:

@@ -29,7 +29,6 @@ def randomized(height: int, width: int, resolution: int = 1, adds_light: bool = 
         for parameter in overlay.parameters():
             parameter.copy_(2 * torch.randn(parameter.shape, generator=generator))
         overlay.evidence.copy_(torch.rand(overlay.evidence.shape, generator=generator))
-        overlay.near.copy_((torch.rand(overlay.near.shape, generator=generator) > 0.5).float())
     return overlay
 
 
@@ -122,25 +121,6 @@ def test_clipping_passes_the_gradient_of_a_prediction_beyond_white() -> None:
     assert image.grad.tolist() == [-1.0, -1.0, 1.0]
 
 
-@pytest.mark.parametrize("adds_light", [False, True])
-def test_held_pixels_do_not_change_and_learn_at_the_usual_pace_once_released(adds_light: bool) -> None:
-    overlay = randomized(4, 6, adds_light=adds_light)
-    overlay.near[:, :3], overlay.near[:, 3:] = 1, 0
-    adam = torch.optim.Adam(overlay.parameters(), lr=0.1, eps=1e-15)
-    start = torch.cat([parameter.detach().clone() for parameter in overlay.parameters()], dim=-1)
-    for held in (True, True, False):
-        overlay.hold_far_pixels(held)
-        loss = composite(random(4, 6, 3), *overlay.layers()).mean() + overlay.opacity().mean()
-        adam.zero_grad()
-        loss.backward()
-        adam.step()
-        overlay.restore_held()
-        moved = (torch.cat(list(overlay.parameters()), dim=-1) - start).abs()
-        assert moved[:, :3].all()
-        assert moved[:, 3:].all() if not held else not moved[:, 3:].any()
-    assert moved[:, 3:].max() < 0.11, "the first step after the release is as large as any"
-
-
 def test_the_gradient_of_the_scene_is_scaled_by_the_transmittance() -> None:
     overlay = randomized(4, 5)
     clean = random(4, 5, 3).requires_grad_()
@@ -160,7 +140,6 @@ def test_a_state_dict_restores_the_overlay(resolution: int, adds_light: bool) ->
     again.load_state_dict(state)
     assert (again.height, again.width, again.resolution, again.adds_light) == (9, 13, resolution, adds_light)
     assert torch.equal(again.evidence, overlay.evidence)
-    assert torch.equal(again.near, overlay.near)
     for reduction in (1, 2, 4):
         for found, expected in zip(again.layers(reduction), overlay.layers(reduction), strict=True):
             assert torch.equal(found, expected)
@@ -214,3 +193,40 @@ def test_impossible_layers_of_an_oracle_overlay_are_refused(
 ) -> None:
     with pytest.raises(InputError, match=message):
         OracleOverlay(transmittance, addition)
+
+
+def test_layers_of_an_overlay_that_adds_light_keep_their_color_whatever_the_matte() -> None:
+    overlay = randomized(6, 8, adds_light=True)
+    transmittance, addition = overlay.layers()
+    torch.testing.assert_close(transmittance, 1 - overlay.matte())
+    torch.testing.assert_close(addition, overlay.color())
+
+
+def test_the_sparsity_of_added_light_counts_the_larger_of_hiding_and_lighting_at_every_pixel() -> None:
+    overlay = randomized(6, 8, adds_light=True)
+    brightest = overlay.color().amax(dim=-1, keepdim=True)
+    torch.testing.assert_close(overlay.opacity(), torch.maximum(overlay.matte(), brightest))
+    assert overlay.opacity().shape == (6, 8, 1)
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (3, 5, 1), (3, 5, 4), (1, 3, 5, 3)])
+def test_layers_of_an_oracle_are_named_with_their_shapes(shape) -> None:
+    with pytest.raises(InputError) as refused:
+        OracleOverlay(torch.ones(shape), torch.zeros(3, 5, 3))
+    assert f"they are {shape} and (3, 5, 3)" in str(refused.value)
+
+
+@pytest.mark.parametrize("value", [-1e-3, 1.001])
+def test_one_transmittance_out_of_range_is_enough(value) -> None:
+    transmittance = torch.full((3, 5, 3), 0.5)
+    transmittance[2, 4, 1] = value
+    with pytest.raises(InputError, match=r"T must lie in \[0, 1\]"):
+        OracleOverlay(transmittance, torch.zeros(3, 5, 3))
+
+
+def test_an_oracle_says_its_frame() -> None:
+    overlay = OracleOverlay(torch.ones(3, 5, 3, dtype=torch.float64), torch.zeros(3, 5, 3, dtype=torch.float64))
+    assert overlay.frame.tolist() == [3, 5, 1, 0]
+    assert {layer.dtype for layer in overlay.layers()} == {torch.float32}
+    clean = random(3, 5, 3)
+    torch.testing.assert_close(overlay.composite(clean), clean)

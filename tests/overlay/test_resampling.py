@@ -177,3 +177,16 @@ def test_around_a_letterboxed_overlay_the_render_is_unchanged(kind: str) -> None
 def test_gradients_of_resampling_are_those_of_finite_differences(function) -> None:
     layer = (0.1 + 0.8 * random(5, 7, 4)).requires_grad_()
     assert torch.autograd.gradcheck(function, (layer,), atol=1e-8)
+
+
+def test_letterboxing_to_a_smaller_frame_averages_and_does_not_skip() -> None:
+    stripes = torch.zeros(8, 32, 1, dtype=torch.float32)
+    stripes[:, ::4] = 1.0  # one column in four: without antialiasing, some of them vanish and others double
+    framed = letterbox(stripes, 2, 8, 0.0)
+    torch.testing.assert_close(framed[:, 1:-1], torch.full((2, 6, 1), 0.25), atol=0.06, rtol=0.0)
+
+
+def test_straight_color_stays_within_white_where_light_exceeds_it() -> None:
+    color, alpha = straight_color(torch.ones(1, 1), torch.tensor([[1.7, 0.5, -0.2]]))
+    torch.testing.assert_close(alpha, torch.ones(1, 1))
+    torch.testing.assert_close(color, torch.tensor([[1.0, 0.5, 0.0]]))
