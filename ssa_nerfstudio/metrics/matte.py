@@ -1,7 +1,9 @@
-"""Matte metrics against the true artifact: pure functions on torch tensors."""
+"""Mattes and layers against those of the true artifact: pure functions."""
 
 from __future__ import annotations
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -50,3 +52,37 @@ def matte_error(alpha: Tensor, target: Tensor) -> float:
     if alpha.shape != target.shape:
         raise ValueError(f"alpha {tuple(alpha.shape)} and target {tuple(target.shape)} differ in shape")
     return (alpha - target.to(alpha.device)).abs().mean().item()
+
+
+def layer_errors(
+    transmitted: np.ndarray, added: np.ndarray, true_transmitted: np.ndarray, true_added: np.ndarray
+) -> dict[str, float]:
+    """Learned layers against the true ones, in the learned ones' frame; truth of another size is averaged over areas.
+
+    An artifact that adds light without hiding any (T = 1: rain) has no matte that alone would be right: of the truth
+    and of what was learned, max over channels of 1 - T and B is taken, the least opacity with which A W can explain it.
+
+    Args:
+        transmitted: T [H, W, 1 or 3], learned.
+        added: B = A W [H, W, 3], learned.
+        true_transmitted: T [H', W', 3].
+        true_added: B [H', W', 3].
+
+    Returns:
+        matte_error: mean absolute error of that; matte_iou: at 0.5; premultiplied_error: mean absolute error of A W
+        against B; transmittance_error: of 1 - A against T.
+    """
+    size = transmitted.shape[1], transmitted.shape[0]
+    truth_t, truth_b = (
+        layer if layer.shape[1::-1] == size else cv2.resize(layer, size, interpolation=cv2.INTER_AREA)
+        for layer in (true_transmitted, true_added)
+    )
+    true_matte = np.maximum(1 - truth_t, truth_b).max(axis=2).clip(0, 1)
+    matte = torch.from_numpy(np.maximum(1 - transmitted[..., 0], added.max(axis=2))).clamp(0, 1)
+    target = torch.from_numpy(np.ascontiguousarray(true_matte))
+    return {
+        "matte_error": matte_error(matte, target),
+        "matte_iou": matte_iou(matte, target > 0.5),
+        "premultiplied_error": float(np.abs(added - truth_b).mean()),
+        "transmittance_error": float(np.abs(transmitted - truth_t).mean()),
+    }

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
-from ssa_nerfstudio.metrics.matte import matte_error, matte_iou
+from ssa_nerfstudio.metrics.matte import layer_errors, matte_error, matte_iou
 
 
 def test_matte_iou_by_hand() -> None:
@@ -37,3 +38,37 @@ def test_matte_error_by_hand() -> None:
         matte_error(alpha, target.T)
     with pytest.raises(ValueError, match="target holds NaN"):
         matte_error(alpha, target * torch.nan)
+
+
+def flat(value: float | tuple[float, ...], height: int = 20, width: int = 30) -> np.ndarray:
+    return np.broadcast_to(np.asarray(value, np.float32), (height, width, 3)).copy()
+
+
+def test_the_true_layers_score_best_and_none_scores_what_they_hide() -> None:
+    transmitted, added = flat(1.0), flat(0.0)
+    transmitted[10:], added[10:] = 0.2, (0.4, 0.2, 0.8)
+    right = layer_errors(transmitted[..., :1], added, transmitted, added)
+    assert right["matte_iou"] == 1
+    assert max(right["matte_error"], right["premultiplied_error"], right["transmittance_error"]) < 1e-6
+    empty = layer_errors(flat(1.0)[..., :1], flat(0.0), transmitted, added)
+    assert empty["matte_iou"] == 0
+    assert empty["matte_error"] == pytest.approx(0.4, abs=1e-6)
+    assert empty["premultiplied_error"] == pytest.approx(0.7 / 3, abs=1e-6)
+
+
+def test_the_matte_of_added_light_is_the_least_opacity_that_explains_it() -> None:
+    added, hidden = flat(0.0), flat(1.0)[..., :1]
+    added[:, :15, 1] = 0.6
+    hidden[:, :15] = 0.4
+    scores = layer_errors(hidden, added, flat(1.0), added)
+    assert scores["matte_error"] == pytest.approx(0, abs=1e-6)
+    assert scores["premultiplied_error"] == 0
+    assert scores["transmittance_error"] == pytest.approx(0.3, abs=1e-6)
+
+
+def test_a_truth_of_another_size_is_averaged() -> None:
+    transmitted, added = flat(0.5, 40, 60), flat((0.1, 0.2, 0.3), 40, 60)
+    transmitted[::2] = 0.7
+    scores = layer_errors(flat(0.6)[..., :1], flat((0.1, 0.2, 0.3)), transmitted, added)
+    assert scores["transmittance_error"] < 1e-6
+    assert scores["premultiplied_error"] < 1e-6
