@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -18,13 +18,14 @@ from rich.progress import track
 
 from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
+from ssa_nerfstudio.cameras.intervals import capture_order
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.photos import read_photo
-from ssa_nerfstudio.data.sources import Source, read_source
+from ssa_nerfstudio.data.sources import Source, read_sources
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.detection import DRAWS, Detection, detect
+from ssa_nerfstudio.evidence.detection import DRAWS, Detection
 from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
-from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.evidence.interval_detection import detect_in_intervals
 
 MIN_PHOTOS = 2
 """With fewer photos of a camera, nothing can be called static."""
@@ -35,7 +36,7 @@ class Camera:
     """The photos of one camera, as a stream."""
 
     name: str
-    """camera-1, ...; names its folder and its messages."""
+    """camera-1, ..., or the name of its folder; names its output's folder and its messages."""
     count: int
     """Their number; approximate for videos."""
     photos: Callable[[int], Iterator[np.ndarray]]
@@ -46,7 +47,8 @@ def read_cameras(data: Path, frames: int) -> list[Camera]:
     """Find the cameras of a capture, without decoding its photos; poses are not read.
 
     Args:
-        data: a nerfstudio dataset (its training photos), a folder of photos or videos, or one video.
+        data: a nerfstudio dataset (its training photos), a folder of photos or videos, of several cameras in a
+            subfolder each or of several sizes or orientations, or one video.
         frames: frames to take from videos.
 
     Raises:
@@ -54,16 +56,13 @@ def read_cameras(data: Path, frames: int) -> list[Camera]:
     """
     if data.suffix == ".json" or (data / "transforms.json").is_file():
         return _of_dataset(Dataset.read(data, eval_interval=8), data)
-    source = read_source(data, "frame", min_photos=MIN_PHOTOS)
-    if source.videos:
-        return [Camera("camera-1", frames, lambda _: _frames(source, frames))]
-    return [
-        Camera("camera-1", len(source.photos), partial(ordered_map, partial(read_photo, upright=True), source.photos))
-    ]
+    return [_of_source(source, frames) for source in read_sources(data, "camera-1", min_photos=MIN_PHOTOS)]
 
 
 def detect_camera(camera: Camera, threads: int, console: Console | None = None, draws: int = DRAWS) -> Detection:
-    """Decode a camera's photos once and test them; memory does not depend on their number.
+    """Decode a camera's photos and test them; memory does not depend on their number.
+
+    They are decoded once, or twice where the artifact changes.
 
     Args:
         camera: its photos.
@@ -74,10 +73,13 @@ def detect_camera(camera: Camera, threads: int, console: Console | None = None, 
     Raises:
         InputError: a photo cannot be decoded.
     """
-    photos = track(
-        camera.photos(threads), camera.name, camera.count, transient=True, console=console, disable=console is None
-    )
-    return detect(accumulate((torch.from_numpy(photo), None) for photo in photos), draws)
+
+    def photos() -> Iterator[torch.Tensor]:
+        stream = camera.photos(threads)
+        stream = track(stream, camera.name, camera.count, transient=True, console=console, disable=console is None)
+        return (torch.from_numpy(photo) for photo in stream)
+
+    return detect_in_intervals(photos, draws)
 
 
 def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = None) -> dict[str, Detection]:
@@ -89,7 +91,7 @@ def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = 
         threads: photos decoded at once; one per core where None.
 
     Returns:
-        One detection per camera, by name: `camera-1`, ...
+        One detection per camera, by name: `camera-1`, ..., or that of its folder.
 
     Raises:
         InputError: no usable photos, too few of them, or one that cannot be decoded.
@@ -131,6 +133,7 @@ def detections_to_json(detections: dict[str, Detection]) -> str:
             "null_shares": d.null_shares,
             "width": d.mask.shape[1],
             "height": d.mask.shape[0],
+            "intervals": [asdict(interval) for interval in d.intervals],
         }
         for name, d in detections.items()
     ]
@@ -145,6 +148,7 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
     cameras = []
     for group in range(max(groups) + 1):
         members = [view for view, at in zip(views, groups, strict=True) if at == group]
+        members.sort(key=lambda view: capture_order(view.path))
         if len(members) < MIN_PHOTOS:
             raise InputError(
                 f"{data}: {members[0].path} is the only photo of its camera",
@@ -152,6 +156,13 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
             )
         cameras.append(Camera(f"camera-{group + 1}", len(members), partial(ordered_map, dataset.read_photo, members)))
     return cameras
+
+
+def _of_source(source: Source, frames: int) -> Camera:
+    if source.videos:
+        return Camera(source.name, frames, lambda _: _frames(source, frames))
+    upright = partial(read_photo, upright=True)
+    return Camera(source.name, len(source.photos), partial(ordered_map, upright, source.photos))
 
 
 def _frames(source: Source, frames: int) -> Iterator[np.ndarray]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import MIN_EDGE_SHARES, measure_edges
 from ssa_nerfstudio.evidence.null_distribution import clopper_pearson, null_shares
-from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL, EnclosedAreas, StaticArea
+from ssa_nerfstudio.evidence.static_area import EnclosedAreas
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 DRAWS = 200
@@ -27,15 +27,29 @@ MIN_OPAQUE_SHARE = 0.01
 """Share of the frame that is opaque and enclosed by static edges, from which on the number of edges does not matter."""
 MIN_OPAQUE_COVERAGE = 0.25
 """Share of the artifact's area that has to be opaque for verdict opaque."""
-CLIPPING_MARGIN = 1.5 / 255
-"""Mean colors this near to black or white in all channels say nothing: values beyond the range look constant."""
+
+
+Verdict = Literal["none", "faint", "opaque"]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Neighboring views between which the artifact does not change."""
+
+    first: int
+    """Number of its first view, from 0, in the order of the capture."""
+    end: int
+    """Number of the view after its last."""
+    verdict: Verdict
+    coverage: float
+    """As for `Detection`."""
 
 
 @dataclass(frozen=True)
 class Detection:
     """Result of the test for one camera."""
 
-    verdict: Literal["none", "faint", "opaque"]
+    verdict: Verdict
     """none; faint: the scene shows through everywhere; opaque: it is hidden somewhere."""
     coverage: float
     """Share of the frame that `mask` covers; 0 for verdict none."""
@@ -51,13 +65,12 @@ class Detection:
     """The same, mean over the shifted captures."""
     evidence: Tensor
     """[h, w] at the working resolution; 0 where the edges move."""
-    area: StaticArea
-    """Where the artifact is; empty for verdict none."""
-
-    @property
-    def mask(self) -> Tensor:
-        """[H, W] bool: True where the artifact is."""
-        return self.area.inside
+    mask: Tensor
+    """[H, W] bool: True where the artifact is; nowhere for verdict none."""
+    opaque: Tensor
+    """[H, W] bool: where it hides the scene, likewise."""
+    intervals: tuple[Interval, ...] = ()
+    """Two or more, where the artifact changes (`interval_detection`)."""
 
     @property
     def too_few_edges(self) -> bool:
@@ -76,9 +89,9 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
     views = int(statistics.views.max())
     edges = measure_edges(statistics)
     shares, evidence = edges.shares, edges.fields[0] * edges.still[0]
-    nowhere = StaticArea.from_mask(torch.zeros(statistics.size, dtype=torch.bool))
+    nowhere = torch.zeros(statistics.size, dtype=torch.bool)
     if views < MIN_VIEWS:
-        return Detection("none", 0.0, 1.0, (0.0, 1.0), views, shares, (0.0, 0.0), evidence, nowhere)
+        return Detection("none", 0.0, 1.0, (0.0, 1.0), views, shares, (0.0, 0.0), evidence, nowhere, nowhere)
     null = list(null_shares(edges, draws, np.random.default_rng(seed)))
     exceeding = sum(_strength(draw) >= _strength(shares) for draw in null)
     p_value = (1 + exceeding) / (1 + draws)
@@ -87,33 +100,13 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
     interval = clopper_pearson(exceeding, draws)
     enclosed = EnclosedAreas.from_edges(edges.mask, statistics)
     if p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_OPAQUE_SHARE):
-        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere)
-    area = enclosed.to_static_area()
-    coverage = float(area.inside.float().mean())
+        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere, nowhere)
+    mask = enclosed.mask()
+    coverage = float(mask.float().mean())
     verdict = "opaque" if enclosed.opaque_share >= MIN_OPAQUE_COVERAGE * coverage else "faint"
-    return Detection(verdict, coverage, p_value, interval, views, shares, (fine, coarse), evidence, area)
-
-
-def static_area(statistics: ImageStatistics) -> StaticArea:
-    """Find the area of static edges without a test, for an overlay that is learned in any case.
-
-    With too few views it is the whole frame. With too few edges it is where the views agree within half a gray level,
-    as no scene does, unless it is clipped to black or white.
-
-    Args:
-        statistics: of all views of one camera, in the order of the capture.
-    """
-    if int(statistics.views.max()) < MIN_VIEWS:
-        return StaticArea.from_mask(torch.ones(statistics.size, dtype=torch.bool))
-    edges = measure_edges(statistics)
-    enclosed = EnclosedAreas.from_edges(edges.mask, statistics)
-    if _strength(edges.shares) < 1 and enclosed.opaque_share < MIN_OPAQUE_SHARE:
-        mean, deviation = statistics.mean(), statistics.deviation()
-        constant = deviation[..., 0] < HALF_GRAY_LEVEL
-        if not constant.all():
-            constant &= ~((mean < CLIPPING_MARGIN).all(dim=-1) | (mean > 1 - CLIPPING_MARGIN).all(dim=-1))
-        return StaticArea.from_mask(constant.cpu())
-    return enclosed.to_static_area()
+    return Detection(
+        verdict, coverage, p_value, interval, views, shares, (fine, coarse), evidence, mask, enclosed.opaque()
+    )
 
 
 def _strength(shares: tuple[float, ...]) -> float:

@@ -7,6 +7,7 @@ docs/detect.md derives it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -70,20 +71,31 @@ def measure_edges(statistics: ImageStatistics) -> EdgeEvidence:
     Args:
         statistics: of all views of one camera, in the order of the capture.
     """
-    means, seen = statistics.brightness.means()
-    # A block that shows nothing of a pixel gets the mean of the others there.
-    average = (means * seen).sum(dim=0) / seen.sum(dim=0).clamp_min(1)
-    means = torch.where(seen, means, average).float() / statistics.scale
-    hidden = (~seen.any(dim=0)).float()[None, None]
+    means, hidden = block_images(statistics)
     coarse = nn.functional.avg_pool2d(means[:, None], COARSE_FACTOR, ceil_mode=True)[:, 0]
     coarse_hidden = nn.functional.max_pool2d(hidden, COARSE_FACTOR, ceil_mode=True)
-    moments = [_gradient_moments(means, hidden), _gradient_moments(coarse, coarse_hidden)]
+    moments = [gradient_moments(means, hidden), gradient_moments(coarse, coarse_hidden)]
     parameters = zip((means, coarse), moments, DISPLACEMENT_WINDOWS, MAX_DISPLACED_SHARES, strict=True)
     still = [
         displaced_share(images, at_scale[:, :2].mean(dim=0), window) <= max_share
         for images, at_scale, window, max_share in parameters
     ]
     return EdgeEvidence(moments, still, [evidence_field(at_scale.sum(dim=0), len(at_scale)) for at_scale in moments])
+
+
+def block_images(statistics: ImageStatistics, blocks: Sequence[int] | None = None) -> tuple[Tensor, Tensor]:
+    """Mean brightness of blocks [K, h, w] in [0, 1], and 1 where no view shows a pixel, else 0: [1, 1, h, w].
+
+    A block that shows nothing of a pixel gets the mean of the others there.
+
+    Args:
+        statistics: of the views.
+        blocks: see `BrightnessBlocks.means`.
+    """
+    means, seen = statistics.brightness.means(blocks)
+    average = (means * seen).sum(dim=0) / seen.sum(dim=0).clamp_min(1)
+    means = torch.where(seen, means, average).float() / statistics.scale
+    return means, (~seen.any(dim=0)).float()[None, None]
 
 
 def evidence_field(sums: Tensor, count: int) -> Tensor:
@@ -117,7 +129,7 @@ def edge_shares(fields: list[Tensor], still: list[Tensor]) -> tuple[float, float
     return fine, coarse
 
 
-def _gradient_moments(images: Tensor, hidden: Tensor) -> Tensor:
+def gradient_moments(images: Tensor, hidden: Tensor) -> Tensor:
     """Gradient along x and y and its squared length [K, 3, h, w] of images [K, h, w].
 
     Central differences, 0 at the border and beside pixels that no view shows (`hidden` [1, 1, h, w]).

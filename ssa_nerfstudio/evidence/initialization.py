@@ -1,7 +1,7 @@
-"""Initialization of an overlay from statistics of the photos.
+"""Initialization of an overlay: by the paper's rule from the photos alone, or from the scene's points.
 
 Source: the paper, section "Modeling screen-space artifacts" (W = mean, A = exp(-sigma / 0.05)); the estimate from
-static edges is ours (docs/method.md).
+points is ours (docs/method.md).
 """
 
 from __future__ import annotations
@@ -9,101 +9,109 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.static_area import StaticArea
+from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
+from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
+from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
+from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.overlay.layer import CONSTANT_INITIALIZATION, INITIAL_MATTE_RANGE, ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 STATISTICS_SCALE = 0.05
 """s of the paper: a standard deviation of s over the views gives an initial matte of 1 / e."""
+MIN_OPACITY = 0.1
+"""Estimated opacities below this are noise: such pixels start clear."""
 
 
 @torch.no_grad()
-def initialize(overlay: ScreenSpaceOverlay, statistics: ImageStatistics, area: StaticArea | None = None) -> None:
-    """Initialize color, matte and sparsity weights of an overlay.
-
-    A sky is as constant as a dashboard, but static edges enclose the dashboard alone. With an `area`, only its opaque
-    part is initialized from the statistics. Elsewhere A and W are those estimated from the edges, with A at least 0.1
-    (that of the constant initialization) near the edges and 0.01 far from them. The sparsity loss spares opaque pixels.
+def initialize(overlay: ScreenSpaceOverlay, statistics: ImageStatistics, within: Tensor | None = None) -> None:
+    """Initialize an overlay by the paper's rule: the mean color, and a matte that falls with the deviation.
 
     Args:
         overlay: changed in place.
         statistics: of the photos, in the overlay's frame.
-        area: static area of an artifact; None for the paper's rule, sigma alone.
+        within: [H, W] bool, outside of which the overlay starts clear; None: the rule holds everywhere.
 
     Raises:
         ValueError: the statistics have another frame size than the overlay.
     """
     if statistics.size != (overlay.height, overlay.width):
         raise ValueError(f"statistics of a frame {statistics.size} for an overlay of {(overlay.height, overlay.width)}")
-    if area is None:
-        area = StaticArea.from_mask(torch.ones(statistics.size, dtype=torch.bool))
-    alpha, addition = _layers(statistics, area, overlay.adds_light)
-    deviation = statistics.deviation()
-    opaque, near = (mask.to(deviation.device)[..., None] for mask in (area.opaque, area.near))
-    hidden = area.matte.to(deviation)[..., None]
+    alpha, mean = _papers_matte(statistics, within), statistics.mean()
+    # Averaged premultiplied; the floor keeps the mean color where the matte is 0.
+    weight = alpha.clamp_min(1e-9)
+    layers = _at_overlay_resolution(torch.cat([weight, weight * mean], dim=-1), overlay)
+    alpha, addition = layers.split((1, 3), dim=-1)
+    overlay.initialize(addition / alpha, alpha, 1 - alpha)
+
+
+def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor) -> LayerEstimate:
+    """Estimate an artifact's layers from samples of the scene's points.
+
+    Args:
+        samples: see `point_samples.sample_points`.
+        guide: see `guide_of`, of the photos that were sampled.
+        opaque: [H, W] bool: where static edges enclose something opaque (`Detection.opaque`), which holds where no
+            point says otherwise.
+    """
+    reduction = working_reduction(*guide.shape[:2])
+    # Photos that vary nowhere show no scene.
+    hidden = (opaque.to(guide.device) | (guide[..., 3] < HALF_GRAY_LEVEL).all()).to(guide)[..., None]
+    expected = torch.cat([1 - hidden, hidden * guide[..., :3]], dim=-1)
+    both = reduced(torch.cat([guide, expected], dim=-1), reduction).to(samples.color.device)
+    return estimate_layers(samples, *both.split((3, 1, 4), dim=-1))
+
+
+@torch.no_grad()
+def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide: Tensor) -> None:
+    """Initialize an overlay from estimated layers.
+
+    Pixels whose estimated opacity is noise start clear. The sparsity loss weighs a pixel by its transmittance.
+
+    Args:
+        overlay: changed in place.
+        estimate: at the working resolution of the overlay's frame.
+        guide: see `guide_of`.
+    """
+    transmittance, addition = estimate.transmittance, estimate.addition
     if overlay.adds_light:
-        hidden = torch.zeros_like(hidden)
-    layers = torch.cat([alpha, addition, deviation, opaque, hidden, near], dim=-1)
-    alpha, addition, deviation, opaque, hidden, near = _reduced(layers, overlay).split((1, 3, 1, 1, 1, 1), dim=-1)
-    color = addition.clamp_min(INITIAL_MATTE_RANGE[0]) if overlay.adds_light else addition / alpha
-    overlay.initialize(color, alpha, torch.minimum(_sparsity_weight(deviation, opaque), 1 - hidden), near > 0)
+        transmittance = torch.ones_like(transmittance)
+    opacity = smallest_matte(transmittance, addition)
+    # A pixel wider, for the soft rim.
+    present = nn.functional.max_pool2d((opacity > MIN_OPACITY).float().permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
+    reduction = working_reduction(overlay.height, overlay.width)
+    layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition), reduction).clamp(0, 1)
+    present = enlarged(present, overlay.height, overlay.width, reduction) > 0
+    layers = torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    transmittance, addition = _at_overlay_resolution(layers, overlay).split((1, 3), dim=-1)
+    if overlay.adds_light:
+        overlay.initialize(addition, 1 - transmittance, transmittance)
+        return
+    # Where the artifact was missed, its mean color is the likeliest. In the photos' mean color a matte would grow
+    # wherever a render is wrong: less contrast is a smaller error.
+    alpha = smallest_matte(transmittance, addition)
+    total = alpha.sum()
+    likely = torch.where(total > 0, addition.sum(dim=(0, 1)) / total.clamp_min(1e-6), CONSTANT_INITIALIZATION[0])
+    floor = INITIAL_MATTE_RANGE[0]
+    overlay.initialize((addition + floor * likely) / (alpha + floor), alpha, transmittance)
 
 
-def _layers(statistics: ImageStatistics, area: StaticArea, adds_light: bool) -> tuple[Tensor, Tensor]:
-    """Initial A [H, W, 1] and B [H, W, 3] at the photos' resolution, float64."""
-    mean, deviation = statistics.mean(), statistics.deviation()
-    opaque, near = (mask.to(mean.device)[..., None] for mask in (area.opaque, area.near))
-    matte, difference = area.matte.to(mean)[..., None], area.difference.to(mean)
-    floor = torch.where(near, CONSTANT_INITIALIZATION[1], INITIAL_MATTE_RANGE[0])
-    if adds_light:
-        matte, floor = torch.zeros_like(matte), INITIAL_MATTE_RANGE[0]
-    # float64, and the matte instead of the transmittance: where no two views show the pixel, 1 - exp(-20) is 1 in
-    # float32, and the mean color would be lost.
-    alpha = torch.where(opaque, torch.exp(-deviation / STATISTICS_SCALE), matte.clamp_min(floor))
-    if adds_light:
-        return alpha, torch.where(opaque, alpha * mean, difference)
-    scene = (mean - torch.where(opaque, 0.0, difference)).clamp(0, 1)
-    addition = torch.minimum(alpha * scene + mean - scene, alpha)
-    estimated = (matte > 0) | (difference != 0).any(dim=-1, keepdim=True)
-    translucent = torch.where(opaque, 0, matte)
-    if translucent.any():
-        addition = torch.where(opaque | estimated, addition, alpha * _mean_color(addition / alpha, translucent))
-    return alpha, addition
+def guide_of(statistics: ImageStatistics) -> Tensor:
+    """Mean and deviation of the photos [H, W, 4], float32: where they have edges, an artifact may have some."""
+    return torch.cat([statistics.mean(), statistics.deviation()], dim=-1).float()
 
 
-def _reduced(layers: Tensor, overlay: ScreenSpaceOverlay) -> Tensor:
-    """Layers [H, W, C] at the overlay's resolution [h, w, C]."""
+def _papers_matte(statistics: ImageStatistics, within: Tensor | None) -> Tensor:
+    """exp(-sigma / s) [H, W, 1], float64; 0 outside of a mask [H, W]."""
+    alpha = torch.exp(-statistics.deviation() / STATISTICS_SCALE)
+    return alpha if within is None else alpha * within.to(alpha.device)[..., None]
+
+
+def _at_overlay_resolution(layers: Tensor, overlay: ScreenSpaceOverlay) -> Tensor:
+    """Layers [H, W, C] averaged to the overlay's resolution [h, w, C]."""
     if overlay.resolution == 1:
         return layers
     height, width = (side * overlay.resolution for side in overlay.alpha_logits.shape[:2])
-    padded = nn.functional.pad(
-        layers.permute(2, 0, 1)[None], (0, width - overlay.width, 0, height - overlay.height), mode="replicate"
-    )
+    planes = layers.permute(2, 0, 1)[None]
+    padded = nn.functional.pad(planes, (0, width - overlay.width, 0, height - overlay.height), mode="replicate")
     return nn.functional.avg_pool2d(padded, overlay.resolution)[0].permute(1, 2, 0)
-
-
-def _mean_color(color: Tensor, matte: Tensor) -> Tensor:
-    """The mean [3] of colors [H, W, 3] weighted by a matte [H, W, 1].
-
-    It is the likeliest color where the artifact was missed, and a matte of this color grows only where the artifact is.
-    A matte with the mean color of the photos would grow wherever a render is wrong: less contrast is a smaller error.
-    """
-    return (color.clamp(0, 1) * matte).sum(dim=(0, 1)) / matte.sum()
-
-
-def _sparsity_weight(deviation: Tensor, opaque: Tensor) -> Tensor:
-    """Weight r of the sparsity loss [h, w, 1]: 1 where nothing is opaque.
-
-    Where the pixel is opaque (`opaque` is its share), r = min(1, sigma / 70th percentile of sigma): near 0 where the
-    views agree, so that sparsity spares the artifact. The views agree on a sky, too, but it is not opaque, so r is 1.
-
-    Args:
-        deviation: sigma [h, w, 1].
-        opaque: [h, w, 1] in [0, 1].
-    """
-    values = deviation.flatten().float()
-    rank = max(1, round(0.7 * values.numel()))
-    reference = torch.kthvalue(values, rank).values  # torch.quantile stops at 16 million values
-    if reference <= 0:
-        return torch.ones_like(deviation)
-    return 1 - opaque * (1 - (deviation / reference).clamp_max(1.0))

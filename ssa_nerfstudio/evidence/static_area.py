@@ -1,50 +1,31 @@
-"""The area that static edges enclose: where an artifact is, where it is opaque, and its estimated layers."""
+"""The area of static edges and of what they enclose."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from ssa_nerfstudio.evidence.additive_light import adds_light
-from ssa_nerfstudio.evidence.edge_estimate import connected_areas, estimate_layers, opaque_areas, textured_areas
+from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 MAX_OPAQUE_DEVIATION = 0.2
 """Deviation relative to the capture's (its 75th percentile) below which an opaque artifact may cover a pixel."""
 HALF_GRAY_LEVEL = 0.5 / 255
-"""Deviations below this are low in any capture, and do not indicate a displacement."""
-NEAR_DISTANCE = 16
-"""Working pixels around a static edge in which its artifact may continue: thin mud, drops whose edges were missed."""
+"""Deviations below this are low in any capture."""
+MIN_AREA = 16
+"""Working pixels; smaller areas are ignored."""
 MIN_OUTLINE_SHARE = 0.5
 """Share of an area's outline that has to be static edges: a uniform artifact has them, a uniform sky does not."""
+MIN_OPAQUE_STEP = 1.6
+"""Natural logarithm of the ratio of the deviations outside and inside, from which on an area is opaque: a fifth. On
+three captures opaque dashboards and buttons have 2.6 to 4.5, paths and skies between drops at most 0.8."""
+_GRAY_LEVEL = 1 / 255
 _NEIGHBORS = np.ones((3, 3), np.uint8)
-
-
-@dataclass(frozen=True)
-class StaticArea:
-    """Where an artifact would be, whatever the verdict, and its estimated layers; an overlay is initialized from it."""
-
-    inside: Tensor
-    """[H, W] bool: static edges, and the uniform areas that they enclose."""
-    near: Tensor
-    """[H, W] bool: `inside`, NEAR_DISTANCE working pixels around static edges, and where the layers are not zero."""
-    opaque: Tensor
-    """[H, W] bool: where nothing or little shows through (`opaque_areas`, `textured_areas`)."""
-    matte: Tensor
-    """[H, W] in [0, 1], estimated from the edges (`estimate_layers`)."""
-    difference: Tensor
-    """[H, W, 3] in [-1, 1]: mean of the views minus the mean without the artifact, estimated likewise."""
-    adds_light: bool
-    """Whether the artifact adds light and hides nothing (`additive_light.adds_light`)."""
-
-    @classmethod
-    def from_mask(cls, mask: Tensor) -> StaticArea:
-        """An area that is opaque in the mask [H, W], bool, and nothing elsewhere; without estimated layers."""
-        return cls(mask, mask, mask, torch.zeros(mask.shape), torch.zeros(*mask.shape, 3), False)
 
 
 @dataclass(frozen=True)
@@ -65,7 +46,7 @@ class EnclosedAreas:
     @classmethod
     def from_edges(cls, edges: np.ndarray, statistics: ImageStatistics) -> EnclosedAreas:
         """Find the areas that edges, uint8 [h, w], enclose."""
-        deviation = _at_working_size(statistics.deviation(), statistics)[0]
+        deviation = reduced(statistics.deviation().float(), statistics.brightness.reduction)[..., 0].cpu().numpy()
         low = deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), HALF_GRAY_LEVEL)
         enclosed = _with_edge_outline(low.astype(np.uint8), cv2.dilate(edges, _NEIGHBORS, iterations=2))
         return cls(statistics, edges, deviation, low, enclosed)
@@ -73,53 +54,57 @@ class EnclosedAreas:
     @property
     def opaque_share(self) -> float:
         """Share of the frame that may be opaque."""
-        return float((self.enclosed | (self.edges & self.low)).mean())
+        return float(self._hiding.mean())
 
-    def to_static_area(self) -> StaticArea:
-        """Edges, widened by a pixel, the areas that they enclose, and the layers estimated from them."""
-        mean = _at_working_size(self.statistics.mean(), self.statistics)
-        hidden = opaque_areas(self.enclosed | (self.edges & self.low), self.deviation)
-        estimate = estimate_layers(mean, self.deviation, self.edges, hidden)
-        distance = cv2.distanceTransform(1 - self.edges, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-        near = (distance <= NEAR_DISTANCE) | (estimate.matte > 0) | estimate.difference.any(axis=0)
-        light = adds_light(mean.mean(axis=0), self.deviation, (self.edges > 0) & ~self.low)
-        if not light:
-            hidden |= textured_areas(self.edges, self.deviation)
-        masks = cv2.dilate(self.edges, _NEIGHBORS) | self.enclosed, near.astype(np.uint8), hidden
-        inside, near, hidden = (_at_full_size(mask, self.statistics) > 0 for mask in masks)
-        return StaticArea(
-            inside=inside,
-            near=inside | near,
-            opaque=hidden,
-            matte=_at_full_size(estimate.matte, self.statistics),
-            difference=torch.stack([_at_full_size(c, self.statistics) for c in estimate.difference], dim=-1),
-            adds_light=light,
-        )
+    @property
+    def _hiding(self) -> np.ndarray:
+        """uint8 [h, w]: enclosed areas, and edges of low deviation."""
+        return self.enclosed | (self.edges & self.low)
 
+    def mask(self) -> Tensor:
+        """[H, W] bool: edges, widened by a pixel, and the areas that they enclose."""
+        return self._at_full_size(cv2.dilate(self.edges, _NEIGHBORS) | self.enclosed)
 
-def _at_working_size(layer: Tensor, statistics: ImageStatistics) -> np.ndarray:
-    """A layer [H, W, C] of the frame as [C, h, w] at the working resolution; partial blocks are dropped."""
-    reduction = statistics.brightness.reduction
-    h, w = (side // reduction for side in statistics.size)
-    planes = layer[: h * reduction, : w * reduction].permute(2, 0, 1)[None].float()
-    return nn.functional.avg_pool2d(planes, reduction)[0].cpu().numpy()
+    def opaque(self) -> Tensor:
+        """[H, W] bool: the areas that hide the scene, because the deviation rises abruptly at their outline.
 
+        A path between drops of mud is an area of low deviation among static edges, too, but at its end, a drop, the
+        deviation does not rise.
+        """
+        areas = cv2.morphologyEx(self._hiding, cv2.MORPH_CLOSE, _NEIGHBORS)
+        level = np.log(self.deviation + _GRAY_LEVEL)
+        kept = np.zeros_like(areas)
+        for box, area in _connected_areas(areas, margin=4):
+            outside = cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS)
+            within = area > cv2.erode(area, _NEIGHBORS, iterations=2)
+            unbounded = not outside.any() or not within.any()
+            if unbounded or np.median(level[box][outside]) - np.median(level[box][within]) >= MIN_OPAQUE_STEP:
+                kept[box] |= area
+        return self._at_full_size(kept)
 
-def _at_full_size(layer: np.ndarray, statistics: ImageStatistics) -> Tensor:
-    """A layer [h, w] at the working resolution as [H, W]: uint8 by repetition, float linearly."""
-    height, width = statistics.size
-    reduction = statistics.brightness.reduction
-    interpolation = cv2.INTER_NEAREST if layer.dtype == np.uint8 else cv2.INTER_LINEAR
-    enlarged = cv2.resize(layer, None, fx=reduction, fy=reduction, interpolation=interpolation)
-    missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]))
-    return torch.from_numpy(np.pad(enlarged, missing, mode="edge"))
+    def _at_full_size(self, layer: np.ndarray) -> Tensor:
+        height, width = self.statistics.size
+        reduction = self.statistics.brightness.reduction
+        enlarged = cv2.resize(layer, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_NEAREST)
+        missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]))
+        return torch.from_numpy(np.pad(enlarged, missing, mode="edge") > 0)
 
 
 def _with_edge_outline(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:
     """The connected areas of whose outline at least MIN_OUTLINE_SHARE is edges: uint8 [h, w]."""
     kept = np.zeros_like(areas)
-    for box, inside in connected_areas(areas, margin=1):
+    for box, inside in _connected_areas(areas, margin=1):
         outline = cv2.dilate(inside, _NEIGHBORS) > inside
         if not outline.any() or edges[box][outline].mean() >= MIN_OUTLINE_SHARE:
             kept[box] |= inside
     return kept
+
+
+def _connected_areas(areas: np.ndarray, margin: int) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
+    """Yield the connected areas of at least MIN_AREA: the box around one, with a margin in pixels, and it."""
+    count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
+    for label in range(1, count):
+        x, y, w, h, size = boxes[label]
+        if size >= MIN_AREA:
+            box = slice(max(0, y - margin), y + h + margin), slice(max(0, x - margin), x + w + margin)
+            yield box, (labels[box] == label).astype(np.uint8)

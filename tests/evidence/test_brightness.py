@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.evidence.brightness import MAX_BLOCKS, WORKING_SIZE, BrightnessBlocks
+from ssa_nerfstudio.evidence.brightness import MAX_BLOCKS, MAX_FINE_BLOCKS, WORKING_SIZE, BrightnessBlocks
 
 
 def noise(views: int, height: int, width: int) -> torch.Tensor:
@@ -33,6 +33,19 @@ def test_blocks_hold_neighboring_views_and_all_of_equal_number(views):
     assert len(means) == len(expected) <= MAX_BLOCKS
     torch.testing.assert_close(means, torch.stack(expected))
     assert seen.all()
+
+
+def test_chosen_blocks_are_joined_as_neighbors():
+    images = noise(100, 3, 4)
+    blocks = BrightnessBlocks(3, 4)
+    for image in images:
+        blocks.add(image, None)
+    assert (len(blocks), blocks.views_per_block) == (50, 2)
+    (mean,), _ = blocks.means([7])
+    torch.testing.assert_close(mean, images[14:16].double().mean(dim=(0, 3)))
+    joined, _ = blocks.means([*range(10), *range(40, 50)])
+    assert len(joined) == 10
+    torch.testing.assert_close(joined[5], images[80:84].double().mean(dim=(0, 3)))
 
 
 def test_large_frames_are_reduced_by_box_filtering():
@@ -71,7 +84,7 @@ def test_memory_does_not_grow_with_the_number_of_views():
     image = noise(1, 4, 4)[0]
     for _ in range(1000):
         blocks.add(image, None)
-    held = sum(value.numel() for value in vars(blocks).values() if isinstance(value, torch.Tensor))
-    assert held == 2 * MAX_BLOCKS * 16
+    held = sum(block.numel() for kept in vars(blocks).values() if isinstance(kept, list) for block in kept)
+    assert held <= MAX_FINE_BLOCKS * (16 + 1)
     means, _ = blocks.means()
     torch.testing.assert_close(means, image.double().mean(dim=-1).expand_as(means))

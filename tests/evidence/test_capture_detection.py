@@ -50,15 +50,20 @@ def test_a_folder_of_photos_is_enough(tmp_path, capsys):
     assert (masks[0][30:] == 255).mean() > 0.98
     assert group["coverage"] == pytest.approx((masks[0] == 0).mean())
     assert Image.open(output / "evidence.png").mode == "RGB"
-    assert "opaque" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert f"a static artifact over {group['coverage']:.1%} of the frame, opaque" in said
+    assert f"Train with an overlay: ssa run {data} --output OUT" in said
 
 
-def test_clean_photos_give_none_and_a_white_mask(tmp_path):
+def test_clean_photos_give_none_and_a_white_mask(tmp_path, capsys):
     data, output, report = photos(tmp_path / "photos", artifact=False), tmp_path / "found", tmp_path / "found.json"
     main(["detect", "--data", str(data), "--output", str(output), "--json", str(report)])
     (group,) = verdicts(report)
     assert (group["verdict"], group["coverage"]) == ("none", 0.0)
     assert (np.asarray(Image.open(output / "mask_colmap.png")) == 255).all()
+    said = capsys.readouterr().out
+    assert "no static artifact in 14 photos" in said
+    assert "Train without an overlay: ssa run" in said
 
 
 def test_a_dataset_is_tested_per_camera_on_its_training_photos(tiny_scene, tmp_path):

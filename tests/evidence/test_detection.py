@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssa_nerfstudio.evidence import detection, edge_evidence
-from ssa_nerfstudio.evidence.detection import detect, static_area
+from ssa_nerfstudio.evidence.detection import detect
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 
 HEIGHT, WIDTH = 96, 128
@@ -107,33 +107,11 @@ def test_a_uniform_sky_without_static_edges_is_no_artifact():
         photo[np.arange(HEIGHT)[:, None] < rows] = (140, 170, 230)
     statistics = statistics_of(photos)
     assert float(statistics.deviation()[:24].max()) == 0
-    assert not static_area(statistics).inside[:24].any()
-    assert static_area(statistics).inside[72:].all()
-    assert not detect(statistics).mask[:24].any()
-
-
-def test_constant_pixels_are_opaque_without_static_edges_unless_they_are_clipped(monkeypatch):
-    """With few views the edge of a uniform board is not significant, but no scene is the same to the last bit."""
-    monkeypatch.setattr("ssa_nerfstudio.evidence.detection.MIN_EDGE_SHARES", (1.0, 1.0))
-    monkeypatch.setattr("ssa_nerfstudio.evidence.detection.MIN_OPAQUE_SHARE", 1.0)
-    photos = capture(8)
-    for photo in photos:
-        photo[:, :20], photo[:, 20:40] = (200, 120, 30), 255
-    area = static_area(statistics_of(photos))
-    assert area.inside[:, :20].all()
-    assert not area.inside[:, 20:].any()
-    white = static_area(statistics_of([np.full_like(photo, 255) for photo in photos]))
-    assert white.inside.all(), "of a frame that never changes anywhere there is nothing else to say"
-
-
-def test_the_static_area_is_empty_without_static_edges_and_the_whole_frame_with_few_views():
-    """With too few views nothing is known, and as in the paper any pixel may be the artifact's."""
-    found, unknown = static_area(statistics_of(capture(30))), static_area(statistics_of(capture(4)))
-    assert not found.inside.any()
-    assert not found.near.any()
-    assert not found.adds_light
-    assert unknown.inside.all()
-    assert unknown.near.all()
+    found = detect(statistics)
+    assert not found.mask[:24].any()
+    assert found.mask[72:].all()
+    assert not found.opaque[:24].any()
+    assert found.opaque[76:].all()
 
 
 def test_recurring_content_that_moves_is_no_artifact():
@@ -165,7 +143,6 @@ def test_a_trembling_camera_is_no_artifact_though_edges_hardly_move(views, monke
     found = detect(statistics)
     assert found.verdict == "none"
     assert max(found.shares) < 0.003
-    assert not static_area(statistics).near.any()
     monkeypatch.setattr(edge_evidence, "MAX_DISPLACED_SHARES", (1.0, 1.0))
     assert detect(statistics).verdict != "none", "without the test for displacements it would be one"
 
@@ -262,8 +239,7 @@ def test_any_frame_and_number_of_views_gives_a_mask_of_its_size(height, width, v
     photos = [torch.from_numpy(rng.integers(0, 256, (height, width, 3), dtype=np.uint8)) for _ in range(views)]
     statistics = accumulate((photo, None) for photo in photos)
     found = detect(statistics, draws=5)
-    area = static_area(statistics)
-    assert found.mask.shape == area.inside.shape == area.near.shape == (height, width)
+    assert found.mask.shape == found.opaque.shape == (height, width)
     assert 0 < found.p_value <= 1
     low, high = found.p_interval
     assert 0 <= low < high <= 1

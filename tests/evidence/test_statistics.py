@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from torch import Tensor
 
+from ssa_nerfstudio.evidence.brightness import MAX_FINE_BLOCKS
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 
 FULL_SCALE = {np.uint8: 255, np.uint16: 65535}
@@ -236,7 +237,7 @@ def test_memory_does_not_grow_with_the_number_of_views() -> None:
             most = max(most, sum(reference() is not None for reference in alive[-20:]))
             yield image, None
 
-    few = accumulate(stream(5))
+    few = accumulate(stream(MAX_FINE_BLOCKS))
     many = accumulate(stream(2000))
     gc.collect()
     assert most <= 2

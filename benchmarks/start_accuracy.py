@@ -1,0 +1,162 @@
+"""Error of the start against the artifact that was simulated: `python benchmarks/start_accuracy.py --data DIR`"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+
+from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence.detection import detect
+from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
+from ssa_nerfstudio.evidence.point_samples import View, sample_points
+from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.experiments.runs.run_configuration import configure
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.plugin.view_geometry import view_matrix
+
+CONSTANTS = {
+    "point_samples": ("WORKING_SIZE", "OCCLUSION_TOLERANCE", "OCCLUSION_RADIUS"),
+    "layer_estimate": (
+        "ROUNDS",
+        "CONJUGATE_GRADIENT_STEPS",
+        "PRIOR_SCALE",
+        "SMOOTHNESS_FLOOR",
+        "OUTLIER_SCALE",
+        "CLEAR_SHARE",
+        "MIN_BRIGHTEST",
+        "DETAIL_RADIUS",
+    ),
+    "guided_upsampling": ("RADIUS", "NOISE"),
+    "initialization": ("MIN_OPACITY",),
+}
+"""Of the modules in `evidence`: what stands between photos and start."""
+
+
+@dataclass
+class Command:
+    """Print the errors of T and B where the artifact is and elsewhere; with --vary, for other constants, too."""
+
+    data: list[Path] = field(default_factory=list)
+    """Datasets that `ssa simulate` has written."""
+    vary: bool = False
+    """Also halve and double each constant."""
+    output: Path | None = None
+    """File to which every result is added, as a line of JSON. What it has is not measured again."""
+
+    def run(self) -> None:
+        """Measure dataset by dataset, and print a table.
+
+        Raises:
+            InputError: a dataset has no layers, or none is given.
+        """
+        if not self.data:
+            raise InputError("no dataset is given", "add --data DIR, as ssa simulate writes it")
+        for path in self.data:
+            if not (path / "layers/undistorted.npz").is_file():
+                raise InputError(f"{path} has no layers/undistorted.npz", "make it with ssa simulate")
+        known = {}
+        if self.output is not None and self.output.exists():
+            lines = map(json.loads, self.output.read_text(encoding="utf-8").splitlines())
+            known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
+        variants = [("", 1.0)]
+        if self.vary:
+            names = [f"{module}.{name}" for module, names in CONSTANTS.items() for name in names]
+            variants += [(name, factor) for name in names for factor in (0.5, 2.0)]
+        for path in self.data:
+            missing = [variant for variant in variants if (path.name, *variant) not in known]
+            for result in _measure(path, missing):
+                known[path.name, result["constant"], result["factor"]] = result
+                print("  ".join(f"{key} {value}" for key, value in result.items()), flush=True)
+                if self.output is not None:
+                    with self.output.open("a", encoding="utf-8") as file:
+                        file.write(json.dumps(result) + "\n")
+        if self.vary:
+            _print_sensitivity(known, [path.name for path in self.data])
+
+
+def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str, Any]]:
+    """Errors of the start with each variant of the constants."""
+    if not variants:
+        return
+    config = configure("ssa-splatfacto", path, Path("outputs"), 1)
+    manager = config.pipeline.datamanager.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    assert isinstance(manager, FullImageDatamanager)
+    photos, cameras = manager.cached_train, manager.train_dataset.cameras
+    points = manager.train_dataparser_outputs.metadata["points3D_xyz"]
+    poses, lenses = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
+    views = [View(photo["image"], photo.get("mask"), poses[i], lenses[i]) for i, photo in enumerate(photos)]
+    statistics = accumulate((view.image, view.mask) for view in views)
+    opaque, guide = detect(statistics).opaque, guide_of(statistics)
+    with np.load(path / "layers/undistorted.npz") as layers:
+        truth = torch.from_numpy(np.concatenate([layers["T"].mean(axis=-1, keepdims=True), layers["B"]], axis=-1))
+    covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
+    for constant, factor in variants:
+        started = time.monotonic()
+        with _scaled(constant, factor):
+            found = estimate(sample_points(points, views), guide, opaque)
+            overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
+            initialize_from(overlay, found, guide)
+        error = torch.cat(overlay.layers(), dim=-1).detach() - truth
+        size = error.abs()
+        yield {
+            "data": path.name,
+            "constant": constant,
+            "factor": factor,
+            "T_on": _mean(size[covered][:, 0]),
+            "T_bias_on": _mean(error[covered][:, 0]),
+            "B_on": _mean(size[covered][:, 1:]),
+            "T_off": _mean(size[~covered][:, 0]),
+            "B_off": _mean(size[~covered][:, 1:]),
+            "adds_light": found.adds_light(),
+            "share": round(found.share(), 4),
+            "seconds": round(time.monotonic() - started, 1),
+        }
+
+
+def _mean(values: torch.Tensor) -> float:
+    return round(float(values.mean()), 4) if values.numel() else 0.0
+
+
+@contextmanager
+def _scaled(constant: str, factor: float) -> Iterator[None]:
+    """A constant of `evidence`, as MODULE.NAME, times a factor."""
+    if not constant:
+        yield
+        return
+    module_name, name = constant.split(".")
+    module = importlib.import_module(f"ssa_nerfstudio.evidence.{module_name}")
+    value = getattr(module, name)
+    setattr(module, name, max(1, round(value * factor)) if isinstance(value, int) else value * factor)
+    try:
+        yield
+    finally:
+        setattr(module, name, value)
+
+
+def _print_sensitivity(known: dict[tuple[str, str, float], dict[str, Any]], names: list[str]) -> None:
+    """A row for each constant at half and at twice its value: mean errors where the artifact is, and elsewhere."""
+
+    def errors(constant: str, factor: float) -> str:
+        rows = [known[name, constant, factor] for name in names]
+        on, off = (np.mean([row[f"T_{where}"] + row[f"B_{where}"] for row in rows]) for where in ("on", "off"))
+        return f"{on:.3f} | {off:.3f}"
+
+    print("\n| constant | half: there | elsewhere | twice: there | elsewhere |\n|---|---|---|---|---|")
+    print(f"| all as they are | {errors('', 1.0)} | {errors('', 1.0)} |")
+    for constant in dict.fromkeys(constant for _, constant, _ in known if constant):
+        print(f"| {constant} | {errors(constant, 0.5)} | {errors(constant, 2.0)} |")
+
+
+if __name__ == "__main__":
+    run_script(Command)

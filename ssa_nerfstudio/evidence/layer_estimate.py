@@ -1,0 +1,213 @@
+"""Estimation of an artifact's layers from the scene's points, before any training.
+
+A photo shows I = T C + B. A point of the scene has the same color C in every view, at another pixel in each; the
+artifact has the same T and B at a pixel in every view. So colors of points, and T and B of pixels, follow from each
+other by linear regression: the training's own problem, solved on the points alone. docs/method.md derives it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.guided_upsampling import local_mean
+from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.overlay.resampling import smallest_matte
+
+ROUNDS = 8
+"""Alternations between layers and colors of points; the last half under the sparse prior."""
+CONJUGATE_GRADIENT_STEPS = 80
+PRIOR_SCALE = 0.05
+"""Difference of T or B up to which the sparse prior takes a pixel for as expected."""
+SMOOTHNESS_FLOOR = 0.01
+"""Difference of layers between neighboring working pixels that is expected even where photos are uniform."""
+OUTLIER_SCALE = 3.0
+"""Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden."""
+CLEAR_SHARE = 0.2
+"""Share of the frame that is taken for clear: its transmittance is set to 1, because T C fixes only the product."""
+MIN_BRIGHTEST = 0.3
+"""Below this the clearest part of the frame is not clear but hidden, as behind binoculars, and is not rescaled."""
+DETAIL_RADIUS = 4
+"""Working pixels: differences from means over windows of this radius are details, and not the scene's."""
+CERTAIN_OPACITY = 0.3
+"""Opacities above this are rarely noise: at most 1.2 % of the frame of three clean captures."""
+MIN_SHARE = 0.02
+"""Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges."""
+_GRAY_LEVEL = 1 / 255
+
+
+@dataclass(frozen=True)
+class LayerEstimate:
+    """Estimated layers at the working resolution."""
+
+    transmittance: Tensor
+    """T [h, w, 1] in [0, 1]."""
+    addition: Tensor
+    """B [h, w, 3] in [0, 1]."""
+
+    def share(self) -> float:
+        """Share of the frame that is hidden or lit by more than CERTAIN_OPACITY."""
+        return float((smallest_matte(self.transmittance, self.addition) > CERTAIN_OPACITY).float().mean())
+
+    def adds_light(self) -> bool:
+        """Whether the artifact adds light and hides nothing.
+
+        What hides at most replaces the scene's light by its own, B <= 1 - T. Details of B (differences from the mean
+        over a window) that exceed it are added light; true if they are the greater part.
+        """
+        added = self.addition.amax(dim=-1, keepdim=True)
+        detail = (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0).square()
+        excess = 1 - (1 - self.transmittance) / added.clamp_min(1e-6)
+        return bool((detail * excess.clamp(0, 1)).sum() > 0.5 * detail.sum())
+
+
+@torch.no_grad()
+def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expected: Tensor) -> LayerEstimate:
+    """Estimate T and B of every pixel.
+
+    Minimizes, over T, B and the points' colors C, the robust squares of I - T C - B over all samples, with two priors:
+    neighboring pixels differ about as much as mean and deviation of the photos do there, and most pixels are as
+    expected (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
+
+    Args:
+        samples: of the scene's points.
+        mean: of the photos, [h, w, 3] in [0, 1] at the working resolution.
+        deviation: of the photos, [h, w, 1], likewise.
+        expected: T and B where no sample says otherwise, [h, w, 4]; (1, 0, 0, 0) is clear.
+    """
+    height, width = samples.size
+    observed, point, pixel = samples.color, samples.point, samples.pixel
+    colors = _initial_colors(samples, deviation)
+    across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
+    layers = expected
+    prior = torch.ones_like(layers[..., :1])
+    residual = observed - colors[point]
+    seen_by = torch.bincount(point, minlength=samples.points)[point]
+    uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
+    for round_ in range(ROUNDS):
+        scale = 1.48 * residual.abs().median() + _GRAY_LEVEL
+        weight = 1 / (1 + residual.square().mean(dim=-1, keepdim=True) / (OUTLIER_SCALE * scale) ** 2)
+        behind = colors[point]
+        precision = weight / (scale**2 * (1 + uncertainty))
+        moments = torch.cat(
+            [
+                torch.ones_like(precision),
+                behind,
+                behind.square().sum(dim=-1, keepdim=True),
+                observed,
+                (behind * observed).sum(dim=-1, keepdim=True),
+            ],
+            dim=-1,
+        )
+        # float64, because colors at a pixel may be equal within rounding, and its block then is all but singular.
+        sums = _sums(pixel, (precision * moments).double(), height * width).reshape(height, width, 9)
+        if round_ >= ROUNDS // 2:
+            prior = 1 / (PRIOR_SCALE**2 + (layers - expected).square().amax(dim=-1, keepdim=True))
+        layers = _solve(sums, across, down, prior, expected, layers)
+        brightest = _quantile(layers[..., 0], 1 - CLEAR_SHARE).clamp_min(MIN_BRIGHTEST)
+        layers = torch.cat([layers[..., :1] / brightest, layers[..., 1:]], dim=-1).clamp(0, 1)
+        transmitted, added = layers.reshape(-1, 4)[pixel].split((1, 3), dim=-1)
+        seen = torch.cat([weight * transmitted * (observed - added), weight * transmitted.square()], dim=-1)
+        total = _sums(point, seen, samples.points)
+        colors = torch.where(total[:, 3:] > 0.01, total[:, :3] / total[:, 3:].clamp_min(1e-6), colors).clamp(0, 1)
+        # Of the color from the other samples: a point seen once says nothing.
+        others = (total[:, 3:][point] - seen[:, 3:]).clamp_min(1e-6)
+        uncertainty = transmitted.square() / others
+        residual = observed - transmitted * colors[point] - added
+    return LayerEstimate(layers[..., :1], layers[..., 1:])
+
+
+def _sums(index: Tensor, values: Tensor, count: int) -> Tensor:
+    """Sum values [S, C] over equal indices in [0, count): [count, C]."""
+    return values.new_zeros(count, values.shape[1]).index_add_(0, index, values)
+
+
+def _initial_colors(samples: PointSamples, deviation: Tensor) -> Tensor:
+    """The points' median colors [N, 3], each sample weighed by how much the photos vary at its pixel.
+
+    What is in front of the scene varies little.
+    """
+    variance = deviation.flatten().square()
+    weight = (variance / variance.median().clamp_min(1e-12)).clamp_max(1.0)[samples.pixel].double() + 1e-3
+    sums = torch.nn.functional.pad(weight.cumsum(0), (1, 0))
+    points = torch.arange(samples.points, device=weight.device)
+    first = torch.searchsorted(samples.point, points)
+    last = torch.searchsorted(samples.point, points, right=True)
+    middle = torch.searchsorted(sums, (sums[first] + sums[last]) / 2) - 1
+    return samples.color[middle.clamp(0, len(samples.color) - 1)]
+
+
+def _smoothness(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
+    """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension."""
+    change = mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True).square() + SMOOTHNESS_FLOOR**2
+    relative = deviation.diff(dim=dimension) / deviation.median().clamp_min(_GRAY_LEVEL)
+    return torch.cat([1 / (change + relative.square()), (1 / change).expand(-1, -1, 3)], dim=-1)
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    values = values.flatten()
+    return values.kthvalue(max(1, round(share * values.numel()))).values.clamp_min(1e-3)
+
+
+def _solve(sums: Tensor, across: Tensor, down: Tensor, prior: Tensor, expected: Tensor, layers: Tensor) -> Tensor:
+    """Minimize the quadratic problem by conjugate gradients, preconditioned pixel by pixel.
+
+    Args:
+        sums: weighted moments [h, w, 9]: 1, C, C C, I, C I.
+        across, down: inverse variances [h, w - 1, 4], [h - 1, w, 4] of the differences of neighbors.
+        prior: inverse variance [h, w, 1] of the differences from `expected` [h, w, 4].
+        layers: T and B to start from, [h, w, 4].
+
+    Returns:
+        T and B [h, w, 4].
+    """
+    # Channels first: each operation below then runs along whole rows of pixels.
+    sums, across, down, prior, expected, layers = (
+        x.double().movedim(-1, 0).contiguous() for x in (sums, across, down, prior, expected, layers)
+    )
+    count, behind, squares, observed, products = sums.split((1, 3, 1, 3, 1))
+    own = torch.cat([squares, count.expand_as(behind)]) + prior
+    diagonal = own.clone()
+    diagonal[:, :, 1:] += across
+    diagonal[:, :, :-1] += across
+    diagonal[:, 1:] += down
+    diagonal[:, :-1] += down
+    # A pixel's 4 x 4 matrix is a diagonal, and `behind` between T and B: eliminating B leaves one equation for T.
+    inverse = 1 / diagonal[1:]
+    ratio = behind * inverse
+    remainder = 1 / (diagonal[:1] - (behind * ratio).sum(dim=0, keepdim=True))
+
+    def system(x: Tensor) -> Tensor:
+        y = own * x
+        y[:1] += (behind * x[1:]).sum(dim=0, keepdim=True)
+        y[1:].addcmul_(behind, x[:1])
+        flow = x.diff(dim=2).mul_(across)
+        y[:, :, 1:] += flow
+        y[:, :, :-1] -= flow
+        flow = x.diff(dim=1).mul_(down)
+        y[:, 1:] += flow
+        y[:, :-1] -= flow
+        return y
+
+    def condition(x: Tensor) -> Tensor:
+        t = (x[:1] - (ratio * x[1:]).sum(dim=0, keepdim=True)) * remainder
+        return torch.cat([t, (x[1:] * inverse).addcmul_(ratio, t, value=-1)])
+
+    residual = torch.cat([products, observed]) + prior * expected - system(layers)
+    conditioned = condition(residual)
+    direction, energy = conditioned, _dot(residual, conditioned)
+    for _ in range(CONJUGATE_GRADIENT_STEPS):
+        image = system(direction)
+        step = energy / _dot(direction, image).clamp_min(1e-20)
+        layers = torch.addcmul(layers, step, direction)
+        residual = torch.addcmul(residual, step, image, value=-1)
+        conditioned = condition(residual)
+        previous, energy = energy, _dot(residual, conditioned)
+        direction = torch.addcmul(conditioned, energy / previous.clamp_min(1e-20), direction)
+    return layers.movedim(0, -1).float()
+
+
+def _dot(a: Tensor, b: Tensor) -> Tensor:
+    return torch.dot(a.flatten(), b.flatten())

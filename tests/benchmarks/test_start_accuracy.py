@@ -1,0 +1,34 @@
+"""Errors of the start against the layers that were drawn."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from benchmarks.start_accuracy import Command
+from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence import layer_estimate
+
+
+def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_scene, tmp_path, capsys):
+    clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
+    main(["simulate", "--data", str(clean), "--output", str(tmp_path / "covered"), "--effects", "dashboard"])
+    output = tmp_path / "errors.jsonl"
+    before = layer_estimate.ROUNDS
+    for _ in range(2):
+        Command([tmp_path / "covered"], vary=True, output=output).run()
+    assert before == layer_estimate.ROUNDS
+    rows = [json.loads(line) for line in output.read_text().splitlines()]
+    assert len({(row["constant"], row["factor"]) for row in rows}) == len(rows)
+    as_it_is, *others = rows
+    assert as_it_is["constant"] == ""
+    assert as_it_is["T_off"] < 0.1 < 0.4 > as_it_is["T_on"], "a dashboard over a third of the frame"
+    assert any(row["T_on"] != as_it_is["T_on"] for row in others)
+    assert capsys.readouterr().out.count("| layer_estimate.PRIOR_SCALE |") == 2
+
+
+def test_a_capture_without_truth_is_refused(tmp_path):
+    with pytest.raises(InputError, match="undistorted"):
+        Command([tmp_path]).run()

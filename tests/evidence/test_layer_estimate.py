@@ -1,0 +1,122 @@
+"""Layers estimated from the scene's points: synthetic scenes whose artifact is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.layer_estimate import estimate_layers
+from ssa_nerfstudio.evidence.point_samples import PointSamples
+
+HEIGHT, WIDTH = 36, 48
+BRIGHTEST = 0.6
+"""Of the scene, so that added light is not clipped."""
+CLEAR = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(HEIGHT, WIDTH, 4)
+
+
+def disc(softness: float = 0.1) -> Tensor:
+    """[H, W, 1]: 1 in a disc, 0 outside."""
+    y, x = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
+    return torch.sigmoid((0.5 - torch.hypot(x - 0.2, y)) / softness)[..., None]
+
+
+def hatching() -> Tensor:
+    """[H, W, 1]: thin diagonal strokes."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT), torch.arange(WIDTH), indexing="ij")
+    return ((x + 2 * y) % 9 < 2).float()[..., None]
+
+
+def vignette() -> Tensor:
+    y, x = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
+    return 0.5 * ((x * x + y * y - 0.4).clamp_min(0) / 1.6)[..., None]
+
+
+def film(matte: Tensor, color: tuple[float, float, float]) -> tuple[Tensor, Tensor]:
+    return 1 - matte, matte * torch.tensor(color)
+
+
+ARTIFACTS = {
+    "opaque and soft": film(disc(), (0.8, 0.4, 0.3)),
+    "opaque and plain in the scene's mean color": film(disc(0.02), (0.3, 0.3, 0.3)),
+    "translucent": film(0.5 * disc(0.02), (1.0, 1.0, 1.0)),
+    "multiplicative": film(vignette(), (0.0, 0.0, 0.0)),
+    "additive": (torch.ones(HEIGHT, WIDTH, 1), 0.4 * hatching().expand(-1, -1, 3)),
+    "none": film(torch.zeros(HEIGHT, WIDTH, 1), (0.0, 0.0, 0.0)),
+}
+
+
+def observe(
+    transmittance: Tensor, addition: Tensor, views: int = 60, points: int = 600, wrong: float = 0.1, seed: int = 0
+) -> tuple[PointSamples, Tensor, Tensor]:
+    """Random points at random pixels; some samples show something else. And the photos' mean and deviation."""
+    generator = torch.Generator().manual_seed(seed)
+    colors = BRIGHTEST * torch.rand(points, 3, generator=generator)
+    point = torch.arange(points).repeat(views)
+    pixel = torch.randint(HEIGHT * WIDTH, (len(point),), generator=generator)
+    behind = colors[point]
+    hidden = torch.rand(len(point), generator=generator) < wrong
+    behind[hidden] = BRIGHTEST * torch.rand(int(hidden.sum()), 3, generator=generator)
+    seen = transmittance.reshape(-1, 1)[pixel] * behind + addition.reshape(-1, 3)[pixel]
+    seen = (seen + 0.02 * torch.randn(seen.shape, generator=generator)).clamp(0, 1)
+    order = np.lexsort((seen.sum(dim=-1).numpy(), point.numpy()))
+    samples = PointSamples(point[order], pixel[order], seen[order], points, (HEIGHT, WIDTH))
+    photos = transmittance * BRIGHTEST * torch.rand(200, HEIGHT, WIDTH, 3, generator=generator) + addition
+    return samples, photos.mean(dim=0), photos.std(dim=0).amax(dim=-1, keepdim=True)
+
+
+@pytest.mark.parametrize("name", ARTIFACTS)
+def test_layers_come_out_without_an_edge_or_a_decision_of_kind(name: str) -> None:
+    transmittance, addition = ARTIFACTS[name]
+    found = estimate_layers(*observe(transmittance, addition), CLEAR)
+    assert (found.transmittance - transmittance).abs().mean() < 0.04
+    assert (found.addition - addition).abs().mean() < 0.03
+    assert found.adds_light() == (name == "additive")
+    present = torch.maximum(1 - transmittance, addition.amax(dim=-1, keepdim=True)) > 0.3
+    assert found.share() == pytest.approx(float(present.float().mean()), abs=0.03)
+
+
+def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> None:
+    """Half of the points are always behind the disc, where they have its color in every view."""
+    transmittance, addition = ARTIFACTS["opaque and soft"]
+    samples, mean, deviation = observe(transmittance, addition, wrong=0.0)
+    inside = disc().flatten()[samples.pixel] > 0.99
+    generator = torch.Generator().manual_seed(1)
+    places = (disc().flatten() > 0.99).nonzero()[:, 0]
+    stuck = (samples.point % 2 == 0) & ~inside
+    pixel, color = samples.pixel.clone(), samples.color.clone()
+    pixel[stuck] = places[torch.randint(len(places), (int(stuck.sum()),), generator=generator)]
+    color[stuck] = addition.reshape(-1, 3)[pixel[stuck]]
+    moved = PointSamples(samples.point, pixel, color, samples.points, samples.size)
+    found = estimate_layers(moved, mean, deviation, CLEAR)
+    assert (found.transmittance - transmittance)[disc() > 0.99].abs().mean() < 0.1
+
+
+def test_without_samples_the_layers_are_as_expected() -> None:
+    """A pixel that no point was seen at takes what its surroundings say, or else what is expected."""
+    expected = CLEAR.clone()
+    expected[:, :20] = torch.tensor([0.0, 0.3, 0.2, 0.1])
+    samples, *_ = observe(*ARTIFACTS["none"])
+    here = samples.pixel % WIDTH >= 24
+    part = PointSamples(samples.point[here], samples.pixel[here], samples.color[here], samples.points, samples.size)
+    mean = torch.full((HEIGHT, WIDTH, 3), 0.5)
+    mean[:, :20] = torch.tensor([0.3, 0.2, 0.1])
+    found = estimate_layers(part, mean, torch.full((HEIGHT, WIDTH, 1), 0.3), expected)
+    assert found.transmittance[:, :16].max() < 0.2
+    assert found.transmittance[:, 30:].min() > 0.8
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_any_number_of_samples_gives_finite_layers(seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    for count in (1, 2, 30):
+        point = torch.randint(5, (count,), generator=generator).sort().values
+        pixel = torch.randint(HEIGHT * WIDTH, (count,), generator=generator)
+        samples = PointSamples(point, pixel, torch.rand(count, 3, generator=generator), 5, (HEIGHT, WIDTH))
+        flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
+        found = estimate_layers(samples, flat, torch.zeros(HEIGHT, WIDTH, 1), CLEAR)
+        for layer in (found.transmittance, found.addition):
+            assert torch.isfinite(layer).all()
+            assert layer.min() >= 0
+            assert layer.max() <= 1
