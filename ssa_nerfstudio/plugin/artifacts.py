@@ -10,10 +10,13 @@ import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from torch import Tensor, nn
 
+from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order, interval_at
+from ssa_nerfstudio.data.photos import MAX_PIXELS
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES, find_frame, match_camera, nearest_aspect
+from ssa_nerfstudio.plugin.view_geometry import metadata
 
 Overlay = ScreenSpaceOverlay | OracleOverlay
 
@@ -21,7 +24,8 @@ Overlay = ScreenSpaceOverlay | OracleOverlay
 class Artifacts(nn.Module):
     """Overlays by camera group; empty until `assign` or `allocate` is called.
 
-    A group without an artifact has no overlay, which checkpoints record, too.
+    A group without an artifact has no overlay, which checkpoints record, too. Where the artifact changes, each interval
+    of a camera's photos is a group.
     """
 
     camera_keys: Tensor
@@ -40,6 +44,8 @@ class Artifacts(nn.Module):
         self._keys: list[list[float]] = []
         self._bare: list[list[float]] = []
         self._group_of_view: list[int | None] = []
+        self.starts: list[str] = []
+        """First photo of each group (`cameras.intervals`), of those with an overlay before the others."""
 
     def __len__(self) -> int:
         return len(self.overlays)
@@ -55,6 +61,7 @@ class Artifacts(nn.Module):
         keys: Tensor,
         groups: list[int],
         lenses: Tensor,
+        starts: list[str] | None = None,
     ) -> None:
         """Assign an overlay to each camera group.
 
@@ -63,6 +70,7 @@ class Artifacts(nn.Module):
             keys: [G, 6], the groups' cameras (`camera_matching.group_cameras`).
             groups: each training view's group.
             lenses: [G, LENS_VALUES], the groups' raw cameras (`camera_matching.describe_lenses`).
+            starts: the groups' first photos, relative to the dataset; None where each camera is one group.
         """
         device = self.camera_keys.device
         covered = torch.tensor([overlay is not None for overlay in overlays], dtype=torch.bool)
@@ -70,6 +78,8 @@ class Artifacts(nn.Module):
         self.camera_keys, self.lenses = keys[covered].to(device), lenses[covered].to(device)
         self.bare_keys = keys[~covered].to(device)
         self._remember_keys()
+        starts = starts or [BEGINNING] * len(keys)
+        self.starts = [start for there in (True, False) for start, c in zip(starts, covered, strict=True) if c == there]
         place = torch.where(covered, covered.cumsum(0) - 1, -1).tolist()
         self._group_of_view = [place[group] if place[group] >= 0 else None for group in groups]
 
@@ -82,9 +92,13 @@ class Artifacts(nn.Module):
         """The overlays with parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
 
+    def group_of_view(self, view: int) -> int | None:
+        """The group of a training view; None where it has no overlay."""
+        return self._group_of_view[view]
+
     def of_view(self, view: int) -> Overlay | None:
         """The overlay of a training view; None where it has none."""
-        group = self._group_of_view[view]
+        group = self.group_of_view(view)
         return None if group is None else self[group]
 
     def layers_of_camera(
@@ -92,14 +106,50 @@ class Artifacts(nn.Module):
     ) -> tuple[Tensor, Tensor] | None:
         """Transmittance and addition of any camera, or None where it has no overlay.
 
-        A camera with the frame of a group shows that group's overlay. A free viewpoint shows the one of its aspect, or
-        the first. `group` overrides both.
+        A camera with the frame of a group shows that group's overlay, and one whose photo is known (`photo` of its
+        metadata) that of its interval. A free viewpoint shows the one of its aspect, or the first. `group` overrides
+        all.
         """
         if group is None:
             group = match_camera(camera, self._keys + self._bare)
+            if group is not None and "photo" in metadata(camera):
+                group = self.at_photo(group, metadata(camera)["photo"])
         if group is None:
             group = nearest_aspect(camera, self._keys)
         return letterboxed_layers(self[group], height, width) if group < len(self) else None
+
+    def at_photo(self, group: int, photo: str) -> int:
+        """The group of a photo, given its path relative to the dataset and any group of its camera."""
+        same = self._intervals(group)
+        return same[interval_at(photo, [self.starts[other] for other in same])]
+
+    def name(self, group: int) -> str:
+        """camera_0, or camera_0_interval_2 where its artifact changes; intervals are counted from 1."""
+        cameras = [self._keys[g] for g in range(len(self)) if self._intervals(g)[0] == g]
+        same = self._intervals(group)
+        name = f"camera_{cameras.index(self._keys[group])}"
+        if len(same) == 1:
+            return name
+        order = sorted(same, key=lambda other: capture_order(self.starts[other]))
+        return f"{name}_interval_{1 + order.index(group)}"
+
+    @property
+    def changes(self) -> bool:
+        """Whether a camera has intervals."""
+        return any(start != BEGINNING for start in self.starts)
+
+    def _intervals(self, group: int) -> list[int]:
+        """All groups of a group's camera, with an overlay and without."""
+        keys = self._keys + self._bare
+        return [other for other, key in enumerate(keys) if key == keys[group]] if self.changes else [group]
+
+    def get_extra_state(self) -> dict[str, list[str]]:
+        """What a checkpoint holds beside the tensors."""
+        return {"starts": self.starts}
+
+    def set_extra_state(self, state: dict[str, list[str]]) -> None:
+        """Take what a checkpoint holds."""
+        self.starts = [str(start) for start in state["starts"]]
 
     @torch.no_grad()
     def coverage(self, group: int) -> tuple[Tensor, Tensor]:
@@ -119,7 +169,7 @@ class Artifacts(nn.Module):
         """Allocate overlays of a checkpoint's shapes, or check that they fit those that are being trained.
 
         Args:
-            state: the model's state dict; entries that older versions lack are added.
+            state: the model's state dict; entries that older versions lack are added, and others dropped.
             prefix: of this module's entries in it.
             wanted: False where the run is to train without an overlay.
 
@@ -130,9 +180,11 @@ class Artifacts(nn.Module):
         for overlay in (f"{prefix}overlays.{g}." for g in range(count)):
             if len(state[f"{overlay}frame"]) == 3:  # checkpoints from before additive light
                 state[f"{overlay}frame"] = F.pad(state[f"{overlay}frame"], (0, 1))
-                if f"{overlay}evidence" in state:
-                    state[f"{overlay}near"] = torch.ones_like(state[f"{overlay}evidence"])
+            state.pop(f"{overlay}near", None)  # checkpoints from before the estimate from points
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
+        for height, width, *_ in frames:
+            if not 0 < height * width <= MAX_PIXELS:
+                raise InputError(f"the checkpoint has an overlay of {height} x {width} pixels", "take another")
         given = f"{prefix}overlays.0.transmittance" in state
         if len(self) or len(self.bare_keys):
             here = [tuple(self[g].frame.tolist()) for g in range(len(self))]
@@ -157,13 +209,16 @@ class Artifacts(nn.Module):
         for name in ("camera_keys", "lenses", "bare_keys"):
             setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))
 
-    def resume_from(self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str) -> None:
+    def resume_from(
+        self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str, photos: list[str]
+    ) -> None:
         """Allocate the overlays of a checkpoint that is resumed, and assign them to this run's views.
 
         Args:
             state, prefix: as for `allocate`.
             keys, groups: of this run's training cameras, as for `assign`.
             setting: this run's overlay: auto, on or given.
+            photos: paths of this run's photos, relative to the dataset.
 
         Raises:
             InputError: the checkpoint has no camera of one of this run's sizes, or was trained with another setting.
@@ -176,9 +231,12 @@ class Artifacts(nn.Module):
                 f"resume with --pipeline.model.overlay {('auto' if here == 'off' else here)}",
             )
         known = torch.cat([state.get(f"{prefix}{name}", torch.zeros(0, 6)) for name in ("camera_keys", "bare_keys")])
-        places: list[int | None] = []
+        if not len(known):  # checkpoints from before groups without an overlay were recorded
+            self._group_of_view = [None] * len(groups)
+            return
+        places: list[int] = []
         for key in keys:
-            place = find_frame(key, known) if len(known) else len(self)
+            place = find_frame(key, known)
             if place is None:
                 there = sorted({(int(width), int(height)) for width, height in known[:, :2].tolist()})
                 raise InputError(
@@ -186,8 +244,23 @@ class Artifacts(nn.Module):
                     f"{tuple(key[:2].int().tolist())}",
                     "resume with the photos and camera-res-scale-factor it was trained with",
                 )
-            places.append(place if place < len(self) else None)
-        self._group_of_view = [places[group] for group in groups]
+            places.append(place)
+        self._keys, self._bare = known[: len(self)].tolist(), known[len(self) :].tolist()
+        self.starts = self._starts_in(state, prefix, len(known))
+        found = [self.at_photo(places[group], photo) for group, photo in zip(groups, photos, strict=True)]
+        self._group_of_view = [place if place < len(self) else None for place in found]
+
+    @staticmethod
+    def _starts_in(state: dict[str, Any], prefix: str, groups: int) -> list[str]:
+        """Of a checkpoint; those from before intervals have none.
+
+        Raises:
+            InputError: there are others than its groups have.
+        """
+        starts = state.get(f"{prefix}_extra_state", {"starts": [BEGINNING] * groups})["starts"]
+        if len(starts) != groups:
+            raise InputError(f"the checkpoint has {groups} groups of photos and {len(starts)} starts", "take another")
+        return list(starts)
 
     def _remember_keys(self) -> None:
         self._keys, self._bare = self.camera_keys.tolist(), self.bare_keys.tolist()
@@ -195,5 +268,8 @@ class Artifacts(nn.Module):
     def _load_from_state_dict(self, state_dict, prefix, *args, **kwargs) -> None:
         for name in ("lenses", "bare_keys"):  # checkpoints of the first version have none
             state_dict.setdefault(prefix + name, getattr(self, name))
+        if prefix + "camera_keys" in state_dict:  # nerfstudio also loads an empty state into the whole pipeline
+            groups = len(state_dict[prefix + "camera_keys"]) + len(state_dict[prefix + "bare_keys"])
+            state_dict[f"{prefix}_extra_state"] = {"starts": self._starts_in(state_dict, prefix, groups)}
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._remember_keys()

@@ -76,6 +76,12 @@ def lens(described: list[float]) -> Lens:
     return Lens(int(width), int(height), fx, fy, cx, cy, tuple(distortion))
 
 
+def fisheye_lenses(cameras: Cameras) -> dict[int, Lens]:
+    """The lenses of those cameras that are fisheye ones, by the camera's number."""
+    described = describe_lenses(cameras).tolist()
+    return {number: lens(row) for number, row in enumerate(described) if row[-1] == CameraType.FISHEYE.value}
+
+
 def describe(cameras: Cameras) -> Tensor:
     """width, height, fx, fy, cx, cy of each camera: [N, 6] float64 on the CPU."""
     fields = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy)

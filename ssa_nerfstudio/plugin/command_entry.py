@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
+import warnings
 from pathlib import Path
 from types import TracebackType
 
-from ssa_nerfstudio._system.terminal_messages import print_error, show_warnings
-from ssa_nerfstudio.errors import SSAError
+from ssa_nerfstudio._system.terminal_messages import print_error, refusal, show_warnings
+from ssa_nerfstudio.errors import SSAError, TrainingStopped
 
 
 def report_in_one_line() -> None:
@@ -19,14 +21,28 @@ def report_in_one_line() -> None:
     if not is_nerfstudio_command():
         return
     show_warnings()
+    # nerfstudio's and torch's, of each other; no user can act on them.
+    warnings.filterwarnings("ignore", category=FutureWarning, module=r"(torch|nerfstudio|gsplat)(\.|$)")
     former = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        if isinstance(error, SSAError):
-            raise SystemExit(print_error(error))  # the interpreter takes the exit code from here
+        known = refusal(error) if isinstance(error, OSError) else error
+        if isinstance(error, KeyboardInterrupt):
+            known = TrainingStopped(f"{Path(sys.argv[0]).name} was stopped before it began")
+        if isinstance(known, SSAError):
+            raise SystemExit(print_error(known))  # the interpreter takes the exit code from here
         former(kind, error, traceback)
 
     sys.excepthook = hook
+
+
+def resuming(checkpoints: Path) -> str:
+    """This `ns-train` command with the option that continues from a folder of checkpoints."""
+    program, method, *options = sys.argv
+    if "--load-dir" in options:
+        at = options.index("--load-dir")
+        options[at : at + 2] = []
+    return shlex.join([Path(program).name, method, "--load-dir", str(checkpoints), *options])
 
 
 def is_nerfstudio_command() -> bool:

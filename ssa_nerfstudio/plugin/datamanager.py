@@ -1,27 +1,54 @@
-"""Photos are decoded, undistorted and cached once; cameras are prepared once, so that a step only picks one."""
+"""Photos are decoded, undistorted and cached once; cameras are prepared once, so that a step only picks one.
+
+nerfstudio undistorts perspective photos when it caches them; fisheye ones are undistorted before, as in `cameras.lens`.
+"""
 
 from __future__ import annotations
 
+import os
+from copy import deepcopy
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager, FullImageDatamanagerConfig
+from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 from nerfstudio.data.datasets.base_dataset import InputDataset
 from PIL import Image
 
-from ssa_nerfstudio.data.photos import read_photo
+from ssa_nerfstudio.cameras.lens import undistort, undistorted_lens
+from ssa_nerfstudio.data.photos import check_mask, read_photo
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.plugin.view_geometry import prepare
+from ssa_nerfstudio.plugin.camera_matching import fisheye_lenses
+from ssa_nerfstudio.plugin.view_geometry import metadata, prepare
 
 TRAINING_REDUCTIONS = (1, 2, 4, 8)
 """Factors by which splatfacto's resolution schedule reduces photos, for which intrinsics are kept ready."""
 
 
 class PhotoDataset(InputDataset):
-    """nerfstudio's dataset, with our decoder: pixels that it would misread are refused, and errors name the file."""
+    """nerfstudio's dataset, with our decoder: pixels that it would misread are refused, and errors name the file.
+
+    Fisheye photos and their cameras leave it as perspective ones.
+    """
+
+    raw_cameras: Cameras
+    """Cameras of the photos as they were taken, at the resolution that is trained on."""
+
+    def __init__(self, dataparser_outputs: DataparserOutputs, scale_factor: float = 1.0) -> None:
+        super().__init__(dataparser_outputs, scale_factor)
+        self.raw_cameras = deepcopy(self.cameras)
+        self._fisheyes = fisheye_lenses(self.raw_cameras)
+        for index, raw in self._fisheyes.items():
+            target = undistorted_lens(raw)
+            for name in ("fx", "fy", "cx", "cy"):
+                getattr(self.cameras, name)[index] = getattr(target, name)
+            self.cameras.camera_type[index] = CameraType.PERSPECTIVE.value
+            if self.cameras.distortion_params is not None:
+                self.cameras.distortion_params[index] = 0
 
     def get_numpy_image(self, image_idx: int) -> np.ndarray:
         """Decode one photo and scale it by `scale_factor`: uint8 [H, W, 3], or [H, W, 4] for RGBA.
@@ -29,15 +56,33 @@ class PhotoDataset(InputDataset):
         Raises:
             InputError: see `read_photo`.
         """
-        cameras = self._dataparser_outputs.cameras  # unlike self.cameras as they were before any scaling
-        size = int(cameras.width[image_idx]), int(cameras.height[image_idx])
-        scaled = self.scale_factor != 1.0
-        photo = read_photo(self.image_filenames[image_idx], None if scaled else size, alpha=True)
-        if not scaled:
+        photo = read_photo(self.image_filenames[image_idx], self._stored_size(image_idx), alpha=True)
+        if self.scale_factor == 1.0:
             return photo
         image = Image.fromarray(photo)
         size = int(image.width * self.scale_factor), int(image.height * self.scale_factor)
         return np.array(image.resize(size, Image.Resampling.BILINEAR))
+
+    def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict:
+        """Photo and mask of one view, as upstream gives them.
+
+        Raises:
+            InputError: see `read_photo` and `check_mask`.
+        """
+        masks = self._dataparser_outputs.mask_filenames
+        if masks is not None:
+            check_mask(masks[image_idx], self._stored_size(image_idx))
+        data = super().get_data(image_idx, image_type)
+        if (raw := self._fisheyes.get(image_idx)) is not None:
+            data["image"] = torch.from_numpy(undistort(data["image"].numpy(), raw))
+            if "mask" in data:
+                data["mask"] = torch.from_numpy(undistort(data["mask"].numpy().astype(np.float32), raw) > 0.5)
+        return data
+
+    def _stored_size(self, image_idx: int) -> tuple[int, int]:
+        """Width and height of a photo before `scale_factor`."""
+        cameras = self._dataparser_outputs.cameras
+        return int(cameras.width[image_idx]), int(cameras.height[image_idx])
 
 
 @dataclass
@@ -63,6 +108,30 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
             return super()._load_images(split, cache_images_device)
         except AssertionError as error:
             raise InputError(f"{error}", "write w and h in transforms.json as the photos are") from error
+
+    @property
+    def folder(self) -> Path:
+        """Of the dataset."""
+        data = Path(self.config.data or self.config.dataparser.data)
+        return data.parent if data.suffix == ".json" else data
+
+    def photo_names(self, dataset: PhotoDataset) -> list[str]:
+        """Paths of a split's photos relative to the dataset."""
+        return [Path(os.path.relpath(path, self.folder)).as_posix() for path in dataset.image_filenames]
+
+    @property
+    def fixed_indices_eval_dataloader(self) -> list[tuple[Cameras, dict]]:  # type: ignore[override]
+        """Cameras and photos of all test views; the cameras' metadata name the photos."""
+        return [self._named(camera, data) for camera, data in super().fixed_indices_eval_dataloader]
+
+    def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
+        """One test view, likewise."""
+        return self._named(*super().next_eval_image(step))
+
+    def _named(self, camera: Cameras, data: dict) -> tuple[Cameras, dict]:
+        photo = self.photo_names(self.eval_dataset)[data["image_idx"]]
+        camera.metadata = {**metadata(camera), "photo": photo}
+        return camera, data
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """Camera and photo of one training view; every view once before any comes again.

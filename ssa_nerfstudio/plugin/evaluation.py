@@ -8,8 +8,12 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.metrics import image as metrics
+from ssa_nerfstudio.metrics.color_correction import color_corrected
 from ssa_nerfstudio.overlay.rgba import over_checkerboard
 from ssa_nerfstudio.plugin.artifacts import Artifacts
+
+MAX_PSNR = 100.0
+"""dB; errors of a thousandth of a gray level."""
 
 
 @torch.no_grad()
@@ -37,6 +41,8 @@ def step_metrics(outputs: Mapping[str, Tensor], target: Tensor, artifacts: Artif
 def view_metrics(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, float]:
     """Metrics of the clean render: psnr (dB), ssim ("valid" padding), mean_color_deviation, flip; and composite_psnr.
 
+    The render is at the mean exposure of the training photos; cc_psnr is of the render brought to the photo's.
+
     Args:
         outputs: the model's.
         target: the photo [H, W, 3] in [0, 1].
@@ -49,6 +55,8 @@ def view_metrics_without_flip(outputs: Mapping[str, Tensor], target: Tensor) -> 
     render = outputs["rgb"]
     values = {
         "psnr": metrics.psnr(render, target),
+        # A photo of one color is corrected without error, and JSON knows no infinity.
+        "cc_psnr": min(metrics.psnr(color_corrected(render, target), target), MAX_PSNR),
         "ssim": metrics.ssim(render, target),
         "mean_color_deviation": metrics.mean_color_deviation(render, target),
     }
@@ -66,7 +74,7 @@ def view_images(outputs: Mapping[str, Tensor], target: Tensor) -> dict[str, Tens
     """
     render = outputs["rgb"]
     pictures = {"img": torch.cat([target, render], dim=1)}
-    if "composite" in outputs:
+    if "overlay_alpha" in outputs:
         alpha = outputs["overlay_alpha"]
         pictures["clean_and_composite"] = torch.cat([render, outputs["composite"]], dim=1)
         pictures["overlay_and_matte"] = torch.cat(

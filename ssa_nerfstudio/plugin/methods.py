@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from nerfstudio.configs.base_config import ViewerConfig
+from typing import cast
+
+from nerfstudio.configs.base_config import LocalWriterConfig, LoggingConfig, ViewerConfig
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 from nerfstudio.plugins.types import MethodSpecification
@@ -13,6 +15,7 @@ from ssa_nerfstudio.plugin.datamanager import SSADatamanagerConfig
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.pipeline import SSAPipelineConfig
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig, machine
+from ssa_nerfstudio.plugin.training.console_table import ConsoleTable
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 
 # Every nerfstudio command imports this module through the entry points, before it loads or renders anything.
@@ -35,6 +38,10 @@ def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:
         steps_per_eval_image=5_000,
         steps_per_eval_all_images=0,
         mixed_precision=False,
+        # nerfstudio's "basic" prints mean times after everything else.
+        logging=LoggingConfig(
+            profiler="none", local_writer=LocalWriterConfig(_target=ConsoleTable, enable=True, stats_to_track=())
+        ),
         machine=machine(),
         pipeline=SSAPipelineConfig(
             datamanager=SSADatamanagerConfig(dataparser=NerfstudioDataParserConfig(load_3D_points=True)),
@@ -51,6 +58,10 @@ def _trainer(name: str, model: SSASplatfactoModelConfig) -> SSATrainerConfig:
             "scales": {"optimizer": FusedAdamConfig(lr=0.005), "scheduler": None},
             "quats": {"optimizer": FusedAdamConfig(lr=0.001), "scheduler": None},
             "overlay": {"optimizer": FusedAdamConfig(lr=5e-3), "scheduler": None},
+            "exposure": {
+                "optimizer": FusedAdamConfig(lr=5e-3),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=5e-4, max_steps=30_000),
+            },
             "camera_opt": {
                 "optimizer": FusedAdamConfig(lr=1e-4),
                 "scheduler": ExponentialDecaySchedulerConfig(
@@ -85,6 +96,7 @@ ssa_splatfacto_paper = MethodSpecification(
         SSASplatfactoModelConfig(
             overlay="on",
             overlay_start="statistics",
+            overlay_intervals="off",
             sparsity="l1",
             sparsity_weight=0.05,
             background_color="black",
@@ -102,3 +114,9 @@ ssa_splatfacto_paper = MethodSpecification(
     ),
     description="The protocol of the SSA-3DGS paper: 3DGS's own settings and the l1 sparsity of 0.05.",
 )
+
+METHODS = {
+    str(method.config.method_name): cast(SSATrainerConfig, method.config)
+    for method in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
+}
+"""Configurations by the methods' names."""

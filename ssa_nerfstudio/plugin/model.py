@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
-from nerfstudio.engine.optimizers import Optimizers
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel
+from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import Parameter
 
@@ -21,16 +20,18 @@ from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_lpips
+from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_metrics
+from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
+from ssa_nerfstudio.plugin.photo_formation import predicted_photo
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
-from ssa_nerfstudio.plugin.training.seed_points import MIN_DISTANCE, color_parameters, outside_cameras
+from ssa_nerfstudio.plugin.training.seed_points import color_parameters, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
 from ssa_nerfstudio.rasterization import rasterizer
-
-_LOG = logging.getLogger(__name__)
+from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 
 @dataclass
@@ -48,6 +49,8 @@ class SSASplatfactoModel(SplatfactoModel):
 
     config: SSASplatfactoModelConfig
     strategy: AdaptiveDensityControl | MarkovChainMonteCarlo
+    near_plane: Tensor
+    """Depth (world units) below which cameras draw nothing."""
 
     def populate_modules(self) -> None:
         """Build splatfacto's Gaussians without CUDA and without downloads, then overlays and strategy."""
@@ -63,8 +66,11 @@ class SSASplatfactoModel(SplatfactoModel):
         if points is not None and not self.config.random_init and len(points[1]):
             self.gauss_params["features_dc"] = Parameter(color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
+        self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
+        self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
+        self._near_plane = NEAR_PLANE
         self.metrics_every = 10
         self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
@@ -85,38 +91,37 @@ class SSASplatfactoModel(SplatfactoModel):
             self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
 
     def k_nearest_sklearn(self, x: Tensor, k: int):
-        """Distances to, and indices of, the k nearest neighbors of points [N, 3]; of fewer where N is too small."""
-        return super().k_nearest_sklearn(x, min(k, len(x) - 1))
+        """Distances to, and indices of, the k nearest neighbors of points [N, 3]; of fewer where N is too small.
+
+        The same distances as upstream's by scikit-learn, whose import takes a second.
+        """
+        points = x.cpu().numpy()
+        distances, indices = KDTree(points).query(points, range(1, min(k + 1, len(points)) + 1))  # pyright: ignore
+        return distances[:, 1:].astype("float32"), indices[:, 1:].astype("float32")  # pyright: ignore
+
+    def examine(self, datamanager: SSADatamanager) -> None:
+        """Called with photos and cameras before the optimizers are built; for a subclass that needs them."""
+
+    def set_near_plane(self, nearest: float | None) -> None:
+        """Set what cameras do not draw by the depth of the nearest seed points (world units; None: unknown)."""
+        self._near_plane = max(NEAR_PLANE, self.config.clearance * (nearest or 0.0))
+        self.near_plane.fill_(self._near_plane)
 
     def start_outside_cameras(self, positions: Tensor) -> None:
         """Drop seed points inside a camera at positions [V, 3]; call it before the optimizers are built."""
         outside = outside_cameras(self.means.data, positions)
-        if not self.config.guards or outside.all():
-            return
-        if not outside.any():
-            _LOG.warning(
-                f"every seed point is within {MIN_DISTANCE} of a camera, nearer than any is drawn: the scene "
-                "is too small; leave --pipeline.datamanager.dataparser.auto-scale-poses True"
-            )
-            return
-        for name, values in self.gauss_params.items():
-            self.gauss_params[name] = Parameter(values.data[outside])
-
-    def step_cb(self, optimizers: Optimizers, step: int) -> None:
-        """Before a step: whether overlays wait for the scene."""
-        super().step_cb(optimizers, step)
-        waiting = step < self.config.scene_head_start and self.config.overlay_start == "detected"
-        for overlay in self.artifacts.learned():
-            overlay.hold_far_pixels(waiting)
+        if self.config.guards and not outside.all():
+            for name, values in self.gauss_params.items():
+                self.gauss_params[name] = Parameter(values.data[outside])
 
     def step_post_backward(self, step: int) -> None:
-        """After the optimizers' step: restore held pixels, clamp parameters, then densify."""
-        for overlay in self.artifacts.learned():
-            overlay.restore_held()
+        """After the optimizers' step: clamp parameters, then densify."""
         if self.config.guards and step % nonfinite.CLAMP_EVERY == 0:
             nonfinite.clamp_scales(self.scales)
             for overlay in self.artifacts.learned():
                 overlay.clamp_logits()
+        if self.exposure is not None:
+            self.exposure.project()
         super().step_post_backward(step)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
@@ -130,15 +135,17 @@ class SSASplatfactoModel(SplatfactoModel):
         for parameter in self.gauss_params.values():
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
-        return super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+        fit_checkpoint(self.exposure, dict, "exposure.")
+        dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored
+        loaded = super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
+        self._near_plane = float(self.near_plane)
+        return loaded
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """splatfacto's groups, and `overlay` where one is learned."""
-        groups = super().get_param_groups()
-        learned = list(self.artifacts.parameters())
-        if learned:
-            groups["overlay"] = learned
-        return groups
+        """splatfacto's groups, and `overlay` and `exposure` where they are learned."""
+        own = {"overlay": self.artifacts, "exposure": self.exposure}
+        parameters = {name: list(module.parameters()) for name, module in own.items() if module is not None}
+        return super().get_param_groups() | {name: learned for name, learned in parameters.items() if learned}
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor | None]:
         """Render one camera.
@@ -151,24 +158,19 @@ class SSASplatfactoModel(SplatfactoModel):
         reduction = self._get_downscale_factor()
         width, height = frame(camera)
         drawn = self._render(camera, width // reduction, height // reduction, reduction)
-        if not len(self.artifacts):
-            return drawn
         if is_viewer_frame():
-            return self._controls.outputs(drawn, camera, width, height)
+            return self._controls.outputs(drawn, camera, width, height) if len(self.artifacts) else drawn
         if self.training:
-            overlay = self.artifacts.of_view(metadata(camera)["cam_idx"])
-            if overlay is None:
-                return drawn
-            behind = (drawn["accumulation"], drawn["background"]) if self.config.ignore_background else None
-            drawn["composite"] = overlay.composite(drawn["rgb"], reduction, behind)
-        else:
+            view, ignored = metadata(camera).get("cam_idx"), self.config.ignore_background
+            photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored)
+            return drawn if photo is None else {**drawn, "composite": photo}
+        if len(self.artifacts):
             layers = self.artifacts.layers_of_camera(camera, width, height)
-            if layers is None:
-                return drawn
-            drawn["composite"] = composite(drawn["rgb"], *layers)
+            if layers is None:  # one camera of several: a mean over all needs its composite, too
+                return drawn | {"composite": drawn["rgb"]}
+            shown = composite(drawn["rgb"], *layers)
+            drawn["composite"] = clip_straight_through(shown) if self.artifacts.exceed_white else shown
             drawn["overlay_rgb"], drawn["overlay_alpha"] = straight_color(*layers)
-        if self.artifacts.exceed_white:
-            drawn["composite"] = clip_straight_through(drawn["composite"])
         return drawn
 
     def _render(self, camera: Cameras, width: int, height: int, reduction: int) -> dict[str, Any]:
@@ -196,6 +198,7 @@ class SSASplatfactoModel(SplatfactoModel):
             Ks=intrinsics(camera, reduction),
             width=width,
             height=height,
+            near_plane=self._near_plane,
             packed=False,
             sh_degree=sh_degree,
             render_mode="RGB+ED" if with_depth else "RGB",
@@ -212,7 +215,8 @@ class SSASplatfactoModel(SplatfactoModel):
         accumulation, color = alpha.squeeze(0), render.squeeze(0)
         if with_depth:
             color = color[..., :3]
-        rgb = F.hardtanh(torch.addcmul(color, 1.0 - accumulation, background), 0.0, 1.0)
+        white = BRIGHTEST if self.training and self.exposure is not None else 1.0
+        rgb = F.hardtanh(torch.addcmul(color, 1.0 - accumulation, background), 0.0, white)
         if self.config.use_bilateral_grid and self.training:
             rgb = self._apply_bilateral_grid(rgb[None], metadata(camera)["cam_idx"], height, width)[0]
         depth = None
@@ -242,8 +246,8 @@ class SSASplatfactoModel(SplatfactoModel):
         """The paper's loss: photometric on the composite, sparsity of the matte, and the strategy's own terms."""
         target = self.target(outputs, batch)
         shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
-        if "mask" in batch:
-            mask = self._downscale_if_required(batch["mask"].float()).to(self.device)
+        mask = self.loss_mask(shown, target, batch)
+        if mask is not None:
             target, shown = target * mask, shown * mask
         losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
         if not self.training:
@@ -263,6 +267,10 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def loss_mask(self, shown: Tensor, target: Tensor, batch: dict) -> Tensor | None:
+        """Weight [H, W, 1] of every pixel in the photometric loss: the dataset's mask, None where there is none."""
+        return self._downscale_if_required(batch["mask"].float()).to(self.device) if "mask" in batch else None
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
         """PSNR of the clean render and of the composite against the photo, and the number of Gaussians.

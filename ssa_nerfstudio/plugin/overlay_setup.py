@@ -2,63 +2,138 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.utils.rich_utils import CONSOLE
+from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 
+from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect, static_area
-from ssa_nerfstudio.evidence.initialization import initialize
+from ssa_nerfstudio.evidence.change_points import change_points
+from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
+from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize, initialize_from
+from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
+from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
+from ssa_nerfstudio.plugin.decisions import tell
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.view_geometry import view_matrix
+
+
+@dataclass(frozen=True)
+class LearnedGroup:
+    """Photos that share an overlay."""
+
+    members: list[int]
+    """Their numbers."""
+    start: str
+    """Name of the first, or BEGINNING (`cameras.intervals`)."""
+    overlay: ScreenSpaceOverlay | None
+    """None where no artifact is detected, under overlay "auto"."""
 
 
 def learned_overlays(
-    config: ModelSettings, photos: list[dict[str, Any]], groups: list[int], sizes: list[tuple[int, int]]
-) -> list[ScreenSpaceOverlay | None]:
-    """Make an overlay for each camera group; under overlay "auto" None where no artifact is detected.
+    config: ModelSettings,
+    photos: list[dict[str, Any]],
+    names: list[str],
+    cameras: Cameras,
+    points: torch.Tensor | None,
+    groups: list[int],
+    sizes: list[tuple[int, int]],
+    gains: torch.Tensor | None = None,
+) -> list[LearnedGroup]:
+    """Make an overlay for each camera group, or for each of its intervals where the artifact changes.
 
     Args:
         config: the model's; overlay "auto" or "on".
-        photos: the datamanager's undistorted cache, in the order of the capture.
+        photos: the datamanager's undistorted cache, in any order.
+        names: of the photos, relative to the dataset.
+        cameras: of the photos.
+        points: of the scene [N, 3], from structure from motion; None where there are none.
         groups: each photo's group.
         sizes: height and width of each group's frame.
+        gains: of the photos [V, 3], where their exposure varies; colors of points are compared without them.
     """
-    overlays: list[ScreenSpaceOverlay | None] = []
-    for group, size in enumerate(sizes):
-        name = "the photos" if len(sizes) == 1 else f"camera {group + 1} of {len(sizes)}"
-        views = [photo for photo, at in zip(photos, groups, strict=True) if at == group]
-        overlays.append(_learned_overlay(config, views, size, name))
-    return overlays
+    learned = []
+    for camera, size in enumerate(sizes):
+        name = "the photos" if len(sizes) == 1 else f"the photos of camera {camera + 1} of {len(sizes)}"
+        members = [index for index, at in enumerate(groups) if at == camera]
+        members.sort(key=lambda index: capture_order(names[index]))
+        statistics, intervals = None, [members]
+        if config.overlay == "auto" or config.overlay_start != "constant":
+            statistics = _statistics([photos[index] for index in members], name)
+            if config.overlay_intervals == "auto":
+                ends = [0, *change_points(statistics), len(members)]
+                intervals = [members[start:end] for start, end in pairwise(ends)]
+        if len(intervals) > 1:
+            _report_changes([names[interval[0]] for interval in intervals[1:]], name)
+        for number, interval in enumerate(intervals):
+            views, part = [photos[index] for index in interval], name
+            if len(intervals) > 1:
+                part = f"{name} of interval {number + 1}"
+                statistics = _statistics(views, part)
+            own = None if gains is None else gains[interval]
+            view_cameras = cameras[torch.tensor(interval)]
+            overlay = _learned_overlay(config, statistics, views, view_cameras, points, size, part, own)
+            learned.append(LearnedGroup(interval, names[interval[0]] if number else BEGINNING, overlay))
+    return learned
 
 
 def _learned_overlay(
-    config: ModelSettings, photos: list[dict[str, Any]], size: tuple[int, int], name: str
+    config: ModelSettings,
+    statistics: ImageStatistics | None,
+    photos: list[dict[str, Any]],
+    cameras: Cameras,
+    points: torch.Tensor | None,
+    size: tuple[int, int],
+    name: str,
+    gains: torch.Tensor | None,
 ) -> ScreenSpaceOverlay | None:
-    adds_light = config.overlay_light == "on"
-    if config.overlay == "on" and config.overlay_start == "constant":
+    def overlay(adds_light: bool) -> ScreenSpaceOverlay:
         return ScreenSpaceOverlay(*size, config.overlay_downscale, adds_light)
-    statistics = _statistics(photos, name)
-    area = None
+
+    light = config.overlay_light == "on"
+    if statistics is None:
+        return overlay(light)
+    by_points = config.overlay_start not in ("statistics", "constant")  # "detected" in earlier config.yml files, too
+    if config.overlay == "on" and config.overlay_start == "statistics":
+        initialize(papers := overlay(light), statistics)
+        return papers
+    detection, guide = detect(statistics), guide_of(statistics)
+    found = None
+    if points is not None and (config.overlay == "auto" or by_points):
+        samples = sample_points(points.to(photos[0]["image"].device), views_of(photos, cameras, gains))
+        found = estimate(samples, guide, detection.opaque) if len(samples.point) else None
     if config.overlay == "auto":
-        detection = detect(statistics)
-        _report(detection, name)
-        if detection.verdict == "none":
+        share = 0.0 if found is None else found.share()
+        _report(detection, share, name)
+        if detection.verdict == "none" and share < MIN_SHARE:
             return None
-        area = detection.area
-    if config.overlay_start == "detected":
-        area = static_area(statistics) if area is None else area
-        if config.overlay_light == "auto":
-            adds_light = area.adds_light
-    overlay = ScreenSpaceOverlay(*size, config.overlay_downscale, adds_light)
-    if config.overlay_start != "constant":
-        initialize(overlay, statistics, area if config.overlay_start == "detected" else None)
-    return overlay
+    if by_points and found is not None:
+        started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
+        initialize_from(started, found, guide)
+        return started
+    started = overlay(light)
+    if by_points:
+        initialize(started, statistics, None if detection.views < MIN_VIEWS else detection.mask)
+    elif config.overlay_start == "statistics":
+        initialize(started, statistics)
+    return started
+
+
+def views_of(photos: list[dict[str, Any]], cameras: Cameras, gains: torch.Tensor | None = None) -> list[View]:
+    """Join photos of the datamanager's cache with their cameras, and with their gains [V, 3]."""
+    poses, lenses = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
+    return [
+        View(photo["image"], photo.get("mask"), poses[i], lenses[i], None if gains is None else gains[i])
+        for i, photo in enumerate(photos)
+    ]
 
 
 def given_overlays(path: Path | None, sizes: list[tuple[int, int]]) -> list[OracleOverlay]:
@@ -92,18 +167,27 @@ def _statistics(photos: list[dict[str, Any]], name: str) -> ImageStatistics:
     return accumulate(track(views, f"Statistics of {name}", total=len(photos), transient=True))
 
 
-def _report(detection: Detection, name: str) -> None:
-    """Print the verdict in one line, with the option that overrides it."""
+def _report_changes(starts: list[str], name: str) -> None:
+    """Tell where the artifact changes in one line, with the option that overrides it."""
+    tell(
+        f"{name[0].upper() + name[1:]} have an artifact that changes at {', '.join(starts)}: {len(starts) + 1} "
+        "intervals, each tested by itself. (--pipeline.model.overlay-intervals off takes them as one.)"
+    )
+
+
+def _report(detection: Detection, share: float, name: str) -> None:
+    """Tell the verdict in one line, with the option that overrides it."""
     name = name[0].upper() + name[1:]
-    if detection.verdict != "none":
-        CONSOLE.print(
-            f"{name} have a static artifact ({detection.verdict}, {detection.coverage:.1%} of the frame): training "
-            "with an overlay. (--pipeline.model.overlay off trains without.)"
+    if detection.verdict != "none" or share >= MIN_SHARE:
+        what = f"{detection.verdict}, {detection.coverage:.1%}" if detection.verdict != "none" else f"soft, {share:.1%}"
+        tell(
+            f"{name} have a static artifact ({what} of the frame): training with an overlay. "
+            "(--pipeline.model.overlay off trains without.)"
         )
         return
     reason = "too few to tell" if detection.views < MIN_VIEWS else f"p = {detection.p_value:.2g}"
     reason += ", too few static edges to report" if detection.too_few_edges else ""
-    CONSOLE.print(
+    tell(
         f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"
     )

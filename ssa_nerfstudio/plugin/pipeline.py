@@ -2,23 +2,35 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
+from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 
-from ssa_nerfstudio.data.training_requirements import check_training
+from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
+from ssa_nerfstudio.data.training_requirements import check_seed_points, check_training
 from ssa_nerfstudio.data.transforms import Transforms
-from ssa_nerfstudio.plugin.camera_matching import describe_lenses, group_cameras
+from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.plugin.camera_matching import describe_lenses, fisheye_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
+from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
+from ssa_nerfstudio.plugin.first_view import FirstView
+from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
+from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
 from ssa_nerfstudio.plugin.validation import check_device, check_settings, check_views
+from ssa_nerfstudio.plugin.view_geometry import view_matrix
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -54,42 +66,112 @@ class SSAPipeline(VanillaPipeline):
         check_settings(config.model, device)
         source = _source(config)
         if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
-            splits = ("train", "val" if test_mode == "val" else "test")
-            check_training(Transforms.read(source), config.datamanager.dataparser.downscale_factor, splits)
+            transforms, parser = Transforms.read(source), config.datamanager.dataparser
+            check_training(transforms, parser.downscale_factor, ("train", "val" if test_mode == "val" else "test"))
+            if test_mode == "val" and parser.load_3D_points:
+                check_seed_points(transforms)
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
         check_views(self.datamanager.train_dataparser_outputs, source)
+        self.first_view = FirstView(lambda: self.datamanager.train_dataset.cameras)
         if test_mode == "val":
             cameras = self.datamanager.train_dataset.cameras
             positions = cameras.camera_to_worlds[:, :3, 3]
             self.model.set_scene_extent(_extent(positions))
             self.model.start_outside_cameras(positions)
-            self._set_overlays()
+            self._examine_photos()
 
-    def _set_overlays(self) -> None:
+    def _examine_photos(self) -> None:
+        """All that reads the training photos before the first step."""
+        _tell_of_fisheyes(self.datamanager.train_dataset.raw_cameras)
+        lenses = describe_lenses(self.datamanager.train_dataset.raw_cameras)
+        # Undistorts and crops the photos and rewrites the cameras: overlays and depths are of the undistorted frame.
+        photos = self.datamanager.cached_train
+        if self.config.artifacts_of is None:
+            check_masks(photos, group_cameras(self.datamanager.train_dataset.cameras)[1])
+        samples = self._start_exposure()
+        self._set_overlays(photos, lenses)
+        if self.model.exposure is not None and samples is not None and len(self.model.artifacts):
+            by_photos = self.config.model.exposure_place == "auto"
+            start_beside_artifact(self.model.exposure, self.model.artifacts, samples, by_photos)
+        self._set_near_plane()
+        self.model.examine(self.datamanager)
+
+    def _set_near_plane(self) -> None:
+        config, seeds, cameras = self.config.model, self.model.seed_points, self.datamanager.train_dataset.cameras
+        if config.strategy == "adc" and config.clearance and seeds is not None and len(seeds[0]):
+            size = int(cameras.width.max()), int(cameras.height.max())
+            poses, Ks = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
+            self.model.set_near_plane(nearest_depth(seeds[0], poses, Ks, *size))
+
+    def _start_exposure(self) -> list[PointSamples] | None:
+        exposure, place, photos = self.model.exposure, self.config.model.exposure_place, self.datamanager.train_dataset
+        if exposure is None:
+            return None
+        exposure.photos = self.datamanager.photo_names(photos)
+        exposure.place = "photo" if place == "auto" else place
+        if self.config.artifacts_of:
+            return None  # of a resumed run
+        return start_from_points(exposure, self.datamanager.cached_train, photos.cameras, self._points())
+
+    def _points(self) -> torch.Tensor | None:
+        """Of the scene, [N, 3]."""
+        seeds = self.model.seed_points
+        return None if seeds is None else seeds[0]
+
+    def get_average_eval_image_metrics(
+        self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
+    ) -> dict[str, Any]:
+        """Metrics over all test views, as upstream; with a warning where the test photos carry the artifact."""
+        metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
+        parser = self.config.datamanager.dataparser
+        ours = len(self.model.artifacts) > 0 and isinstance(parser, NerfstudioDataParserConfig)
+        if ours and not Transforms.read(_source(self.config)).test_photos_are_clean:
+            _LOG.warning(
+                "the test photos carry the artifact, so psnr, ssim and flip of the clean render say little; read "
+                "composite_psnr, or state clean photos as test_filenames in transforms.json"
+            )
+        return metrics
+
+    def _set_overlays(self, photos: list[dict[str, Any]], lenses: torch.Tensor) -> None:
         setting = self.config.model.overlay
         resumed = load_pipeline_state(self.config.artifacts_of) if self.config.artifacts_of else None
         if setting == "off" or (resumed is None and self.config.artifacts_of):
             return  # loading the checkpoint will say what is wrong with it
-        lenses = describe_lenses(self.datamanager.train_dataset.cameras)
-        # Undistorts and crops the photos and rewrites the cameras: overlays are in undistorted pixels.
-        photos = self.datamanager.cached_train
         keys, groups = group_cameras(self.datamanager.train_dataset.cameras)
         sizes = [(int(key[1]), int(key[0])) for key in keys]
         artifacts = self.model.artifacts
+        starts, names = None, self.datamanager.photo_names(self.datamanager.train_dataset)
         if resumed is not None:
-            artifacts.resume_from(resumed, "_model.artifacts.", keys, groups, setting)
+            artifacts.resume_from(resumed, "_model.artifacts.", keys, groups, setting, names)
             return
         if setting == "given":
             overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
-            overlays = learned_overlays(self.config.model, photos, groups, sizes)
+            cameras, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
+            gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
+            learned = learned_overlays(self.config.model, photos, names, cameras, self._points(), groups, sizes, gains)
+            overlays, starts = [each.overlay for each in learned], [each.start for each in learned]
+            keys = keys[[groups[each.members[0]] for each in learned]]
+            group_of = {view: group for group, each in enumerate(learned) for view in each.members}
+            groups = [group_of[view] for view in range(len(photos))]
         first = [groups.index(g) for g in range(len(keys))]
-        artifacts.assign(overlays, keys, groups, lenses[first])
+        artifacts.assign(overlays, keys, groups, lenses[first], starts)
 
 
 def _source(config: SSAPipelineConfig) -> Path:
     data = config.datamanager.data or config.datamanager.dataparser.data
     return Path(data)
+
+
+def _tell_of_fisheyes(cameras: Cameras) -> None:
+    for raw in list(fisheye_lenses(cameras).values())[:1]:
+        target = undistorted_lens(raw)
+        angle = 2 * np.degrees(np.arctan(target.width / 2 / target.fx))
+        left = distort(np.ones((target.height, target.width), np.float32), raw, 0.0).mean()
+        _LOG.warning(
+            f"fisheye photos are undistorted: training sees {angle:.0f} degrees across, {left:.0%} of their pixels. "
+            "gsplat 1.4.0 draws fisheye lenses without distortion alone"
+        )
 
 
 def _extent(positions: torch.Tensor) -> float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
@@ -16,24 +16,35 @@ from ssa_nerfstudio.rasterization import RasterizerName
 class ModelSettings(SplatfactoModelConfig):
     """splatfacto's settings and ours; `model.SSASplatfactoModelConfig` adds the class that they configure."""
 
+    own_steps: ClassVar[tuple[str, ...]] = ()
+    """Settings of a subclass that count steps of a full training, to be scaled with all other schedules."""
     overlay: Literal["auto", "on", "off", "given"] = "auto"
     """auto: learn an overlay for each camera whose photos have a static artifact, and none otherwise; on: learn one for
     every camera; off: plain splatfacto; given: use the oracle overlay in overlay_given."""
     overlay_given: Path | None = None
     """For overlay "given": an .npz file with arrays T and B [H, W, 3] of I = clip(T C + B), in the undistorted frame
     (of a rig: T0, B0, T1, B1, ... in the order of its camera groups)."""
-    overlay_start: Literal["detected", "statistics", "constant"] = "detected"
-    """Initialization. statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); detected: the same where
-    the artifact is opaque, elsewhere the estimate from static edges; constant: W = 0.5, A = 0.1 (paper's ablation)."""
+    overlay_start: Literal["points", "statistics", "constant"] = "points"
+    """Initialization. points: estimated from the scene's points, as seen in all photos; without points as statistics,
+    but only within static edges; statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); constant: W = 0.5,
+    A = 0.1 (paper's ablation)."""
     overlay_light: Literal["auto", "on", "off"] = "auto"
-    """Additive light (rain, glare), I = (1 - A) C + W: auto decides from the photos where overlay_start is detected;
+    """Additive light (rain, glare), I = (1 - A) C + W: auto decides where overlay_start is points;
     off is the paper's I = (1 - A) C + A W."""
-    scene_head_start: int = 4_000
-    """Steps in which only pixels near static edges of the overlay are learned, where overlay_start is detected."""
+    overlay_intervals: Literal["auto", "off"] = "auto"
+    """auto: where the artifact changes in the order of the photos, learn an overlay for each interval; off: one for all
+    photos of a camera."""
     overlay_downscale: Literal[1, 2, 4] = 1
     """Side of the block of photo pixels per overlay pixel: 1, 1/2 or 1/4 of the photos' resolution."""
+    exposure: Literal["off", "affine"] = "off"
+    """affine: learn a gain and an offset per color channel for each photo, whose mean over the photos is the identity:
+    for captures whose exposure or white balance varies. off: all photos have one exposure."""
+    exposure_place: Literal["auto", "scene", "photo"] = "auto"
+    """What exposure acts on. photo: on scene and artifact together, for an artifact on or in front of the lens; scene:
+    on the scene alone, for what software drew into the finished photo; auto: as the photos' samples of the scene's
+    points say, and photo where they say nothing."""
     sparsity: Sparsity = "log"
-    """Sparsity term of the matte: log (concave, weighted by evidence), l1 (the paper's), off."""
+    """Sparsity term of the matte: log (concave, weighted by the initial transmittance), l1 (the paper's), off."""
     sparsity_weight: float = 0.02
     """Weight of the sparsity term, lambda_sparse, not negative; the paper has 0.05, and 0.01 for mud."""
     ignore_background: bool = True
@@ -64,5 +75,8 @@ class ModelSettings(SplatfactoModelConfig):
     (A checkpoint with values that are not finite is refused in any case.)"""
     max_skipped_steps: int = 100
     """Guards: number of skipped steps in a row that ends the training, checked every 100 steps."""
+    clearance: float = 0.5
+    """ADC: a camera does not draw Gaussians nearer than this share of the depth of the nearest seed points, in [0, 1):
+    no surface is there, only floaters that fill the picture of a camera nearby. 0: gsplat's near plane of 0.01."""
     rasterizer: RasterizerName = "auto"
     """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""

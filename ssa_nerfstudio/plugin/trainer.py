@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -15,13 +18,15 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ssa_nerfstudio.errors import InputError, TrainingError
+from ssa_nerfstudio.errors import InputError, TrainingError, TrainingStopped
+from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, resuming
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
 from ssa_nerfstudio.plugin.training.checkpoints import (
     LOAD_ERRORS,
     damage,
     load_pipeline_state,
     newest_first,
+    reason,
     staged_checkpoints,
     step_of,
 )
@@ -29,7 +34,7 @@ from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.training.schedules import scaled
-from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device
+from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device, check_length, check_settings
 
 _LOG = logging.getLogger(__name__)
 
@@ -55,6 +60,8 @@ class SSATrainer(Trainer):
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         check_device(config.machine.device_type)
+        check_settings(config.pipeline.model, config.machine.device_type)  # before schedules are rounded up
+        check_length(config.max_num_iterations, config.pipeline.datamanager.camera_res_scale_factor)
         if config.scale_schedules:
             config = scaled(config)
         super().__init__(config, local_rank, world_size)
@@ -89,18 +96,24 @@ class SSATrainer(Trainer):
         The overlays of a resumed run are allocated here, before the optimizers are built.
         """
         self.config.pipeline.artifacts_of = self._resumed_checkpoint()
-        super().setup(test_mode)
+        with self._stopped_in_one_line():
+            super().setup(test_mode)
         thin_event_writers(self.config.logging.steps_per_log)
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._report_artifact))
 
     def _report_artifact(self, step: int) -> None:
         artifacts = self.pipeline.model.artifacts
+        config = shlex.quote(str(self.config.get_base_dir() / "config.yml"))
+        lines = [f"Splats: ssa export-splats --load-config {config} --output-dir splats"]
         for group in range(len(artifacts)):
-            name = f"Artifact of camera {group}" if len(artifacts) > 1 else "Artifact"
-            CONSOLE.print(f"[bold]{name}[/bold]: {artifacts.summary(group)}", highlight=False)
+            name = f"Artifact of {artifacts.name(group)}" if len(artifacts) > 1 else "Artifact"
+            lines.append(f"{name}: {artifacts.summary(group)}")
         if len(artifacts):
-            config = self.config.get_base_dir() / "config.yml"
-            CONSOLE.print(f"ssa export-overlay --load-config {config} --output artifact", soft_wrap=True)
+            lines.append(f"Export it: ssa export-overlay --load-config {config} --output artifact")
+        else:
+            why = "the overlay was off" if self.config.pipeline.model.overlay == "off" else "none was detected"
+            lines.append(f"Artifact: {why}, no overlay was trained")
+        CONSOLE.print(*lines, sep="\n", markup=False, emoji=False, highlight=False, soft_wrap=True)
 
     def _load_checkpoint(self) -> None:
         """Resume as upstream does; without --load-step from the newest intact checkpoint."""
@@ -134,7 +147,7 @@ class SSATrainer(Trainer):
         except InputError:
             raise  # of the settings: no other checkpoint helps
         except LOAD_ERRORS as error:
-            return (str(error) or type(error).__name__).splitlines()[0]
+            return reason(error)
         broken = first_nonfinite(self.pipeline.state_dict())
         return None if broken is None else f"its {broken} holds values that are not finite"
 
@@ -204,7 +217,28 @@ class SSATrainer(Trainer):
         if self.config.max_num_iterations == 0:
             CONSOLE.print(f"The checkpoint is at step {self._start_step} of {planned}: nothing is left to train.")
             return
-        super().train()
+        with self._stopped_in_one_line():
+            super().train()
+
+    @contextmanager
+    def _stopped_in_one_line(self) -> Iterator[None]:
+        """Let ctrl+c in `ns-train` say how to go on; upstream prints a traceback and ends with exit code 0.
+
+        After the training it closes the viewer, as upstream asks for.
+        """
+        try:
+            yield
+        except KeyboardInterrupt:
+            if not is_nerfstudio_command():
+                raise
+            if self.training_state == "completed":
+                return
+            saved = newest_first(self.checkpoint_dir)
+            if not saved:
+                raise TrainingStopped(f"at step {self.step}, before the first checkpoint", "start again") from None
+            raise TrainingStopped(
+                f"at step {self.step}", f"go on from step {step_of(saved[0])}: {resuming(self.checkpoint_dir)}"
+            ) from None
 
 
 def _gradient_norms(model: torch.nn.Module) -> dict[str, torch.Tensor]:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,36 @@ from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
     from ssa_nerfstudio.plugin.settings import ModelSettings
+
+
+_LOWEST = {
+    "cap_max": 1,
+    "max_skipped_steps": 1,
+    "mcmc_opacity_regularizer": 0,
+    "mcmc_scale_regularizer": 0,
+    "mcmc_scale_start": 1e-6,
+    "mcmc_stop_at": 0,
+    "num_downscales": 0,
+    "num_random": 1,
+    "pause_after_reset": 0,
+    "refine_every": 1,
+    "reset_alpha_every": 1,
+    "resolution_schedule": 1,
+    "sh_degree": 0,
+    "sh_degree_interval": 1,
+    "sparsity_weight": 0,
+}
+"""The lowest values of settings of the model that work."""
+
+
+def check_length(steps: int, scale_factor: float) -> None:
+    """Refuse trainings of no steps or on photos of no size."""
+    if steps < 1:
+        raise InputError(f"--max-num-iterations must be at least 1, got {steps}")
+    if not 0 < scale_factor < math.inf:
+        raise InputError(
+            f"--pipeline.datamanager.camera-res-scale-factor must be above 0, got {scale_factor}", "1 keeps the size"
+        )
 
 
 def check_device(device: torch.device | str) -> None:
@@ -44,9 +75,19 @@ def check_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoi
 
 def check_settings(model: ModelSettings, device: torch.device | str) -> None:
     """Refuse settings of the model that contradict each other or the machine."""
-    if not model.sparsity_weight >= 0:
+    for name, lowest in _LOWEST.items():
+        value = getattr(model, name)
+        if value is not None and not lowest <= value < math.inf:
+            raise InputError(f"--pipeline.model.{name.replace('_', '-')} must be at least {lowest}, got {value}")
+    if not 0 <= model.clearance < 1:
+        raise InputError(f"--pipeline.model.clearance must be in [0, 1), got {model.clearance}")
+    if not 0 < model.mcmc_opacity_start < 1:
+        raise InputError(f"--pipeline.model.mcmc-opacity-start must be in (0, 1), got {model.mcmc_opacity_start}")
+    if model.exposure != "off" and model.use_bilateral_grid:
         raise InputError(
-            f"--pipeline.model.sparsity-weight {model.sparsity_weight} must not be negative", "0.02 is the default"
+            f"--pipeline.model.exposure {model.exposure} and --pipeline.model.use-bilateral-grid True both model a "
+            "photo's colors",
+            "choose one",
         )
     if model.rasterizer == "reference" and model.use_absgrad and model.strategy == "adc":
         raise InputError(

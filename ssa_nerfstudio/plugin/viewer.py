@@ -62,7 +62,7 @@ class ArtifactControls(nn.Module):
         self.a_show = ViewerCheckbox("Show overlay", False, hint="Off: rgb is the clean scene")
         self.b_layer = ViewerDropdown("Layer", LAYERS[0], LAYERS, hint="What is shown where rgb was")
         self.c_strength = ViewerSlider("Strength", 1.0, 0.0, 1.0, 0.05, hint="Factor of the matte")
-        self.d_camera = _CameraChoice(lambda: len(artifacts()))
+        self.d_camera = _CameraChoice(artifacts)
         self.e_summary = _Line()
         self.f_save = _SaveButton(self._picture)
 
@@ -122,15 +122,17 @@ class ArtifactControls(nn.Module):
 
 
 class _CameraChoice(ViewerDropdown[str]):
-    """Chooses the camera group; hidden where there is one."""
+    """Chooses the camera group, or the interval where the artifact changes; hidden where there is one overlay."""
 
-    def __init__(self, count: Callable[[], int]) -> None:
+    def __init__(self, artifacts: Callable[[], Artifacts]) -> None:
         super().__init__("Camera", AUTOMATIC, [AUTOMATIC], hint="Which camera's artifact is shown, counted from 0")
-        self._count = count
+        self._artifacts = artifacts
 
     def _create_gui_handle(self, viser_server: viser.ViserServer) -> None:
-        count = self._count()
-        self.options, self.visible = [AUTOMATIC, *(f"camera {group}" for group in range(count))], count > 1
+        artifacts = self._artifacts()
+        kind = "interval" if artifacts.changes else "camera"
+        self.options = [AUTOMATIC, *(f"{kind} {group}" for group in range(len(artifacts)))]
+        self.visible = len(artifacts) > 1
         super()._create_gui_handle(viser_server)
 
 

@@ -170,7 +170,11 @@ def test_resuming_a_learned_overlay_with_a_given_one_is_refused(
 @pytest.mark.parametrize(
     ("model", "complaint"),
     [
-        ({"sparsity_weight": -1.0}, "must not be negative"),
+        ({"sparsity_weight": -1.0}, "--pipeline.model.sparsity-weight must be at least 0, got -1.0"),
+        ({"sparsity_weight": float("nan")}, "--pipeline.model.sparsity-weight must be at least 0, got nan"),
+        ({"cap_max": -5}, "--pipeline.model.cap-max must be at least 1, got -5"),
+        ({"refine_every": 0}, "--pipeline.model.refine-every must be at least 1, got 0"),
+        ({"mcmc_opacity_start": 1.0}, "--pipeline.model.mcmc-opacity-start must be in (0, 1), got 1.0"),
         ({"rasterizer": "reference"}, "--pipeline.model.use-absgrad False"),
         ({"rasterizer": "gsplat"}, "does not run on cpu"),
     ],
@@ -181,6 +185,18 @@ def test_settings_that_cannot_work_are_refused(
     config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, model)
     config.machine.device_type = "cpu"
     assert complaint in refusal(lambda: train_and_evaluate(config))
+
+
+@pytest.mark.parametrize("steps", [0, -5])
+def test_a_training_of_no_steps_is_refused(tiny_scene, tmp_path, steps, train):
+    refused = refusal(lambda: train(tiny_scene, tmp_path, steps))
+    assert f"--max-num-iterations must be at least 1, got {steps}" in refused
+
+
+@pytest.mark.parametrize("factor", [0.0, -1.0, float("nan")])
+def test_photos_of_no_size_are_refused(tiny_scene, tmp_path, factor, configure_training, train_and_evaluate):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, scale_factor=factor)
+    assert "camera-res-scale-factor must be above 0" in refusal(lambda: train_and_evaluate(config))
 
 
 def test_a_focal_length_that_is_no_number_is_refused(broken_scene, tmp_path, train):

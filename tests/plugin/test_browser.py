@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -56,6 +58,21 @@ def eventually(page, holds: Callable[[np.ndarray], bool], what: str) -> np.ndarr
         before = seen
         page.wait_for_timeout(500)
     raise AssertionError(f"after a minute: {what}")
+
+
+def test_it_opens_at_the_middle_photo(page, config, tiny_scene):
+    """Of all training photos that one is most alike to what the page shows, where no artifact is."""
+    seen = eventually(page, lambda seen: seen.std() > 0.02, "no frame came")
+    transforms = json.loads((tiny_scene / "transforms.json").read_text())
+    width, height = transforms["w"], transforms["h"]
+    shown = round(height * seen.shape[1] / seen.shape[0])  # the page is a little narrower than the photo
+    view = cv2.resize(seen, (shown, height), interpolation=cv2.INTER_AREA)
+    margin = slice((width - shown) // 2, (width - shown) // 2 + shown)
+    clear = Checkpoint.read(config).artifacts()[0].layers()[0].detach().numpy()[:, margin, 0] > 0.98
+    clear[-height // 3 :, : width // 3] = False  # viser's axes
+    photos = [np.asarray(Image.open(tiny_scene / name)) for name in transforms["train_filenames"]]
+    alike = [np.corrcoef(photo[:, margin][clear].ravel(), view[clear].ravel())[0, 1] for photo in photos]
+    assert np.argmax(alike) == len(photos) // 2, np.round(alike, 2)
 
 
 def test_the_artifact_appears_and_disappears(page, config):

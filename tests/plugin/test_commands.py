@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -70,6 +72,46 @@ def checkpoint(config: Path) -> dict:
 
 def test_a_killed_run_resumes_to_the_step_that_was_asked_for(config):
     assert checkpoint(config)["step"] == 249
+
+
+@pytest.fixture(scope="module")
+def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
+    """`ns-train` that got ctrl+c after its first checkpoint."""
+    output = tmp_path_factory.mktemp("stopped")
+    options = ["--data", tiny_scene, "--output-dir", output, "--max-num-iterations", "20000", "--steps-per-save", "20"]
+    words = [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=OFFLINE)
+    deadline = time.monotonic() + 240
+    while not list(output.rglob("step-*.ckpt")):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    return subprocess.CompletedProcess(words, process.returncode, out, err)
+
+
+def test_ctrl_c_ends_a_training_in_one_line_with_the_command_that_resumes(stopped):
+    assert stopped.returncode == 130
+    assert "Traceback" not in stopped.stdout + stopped.stderr
+    assert "KeyboardInterrupt" not in stopped.stdout + stopped.stderr
+    line = stopped.stderr.splitlines()[-1]
+    assert re.match(r"ssa-nerfstudio: stopped: at step \d+; go on from step \d+: ns-train ssa-splatfacto ", line)
+
+
+def test_that_command_resumes_and_the_verdict_is_its_last_word(stopped):
+    start, words = re.split(r"go on from step (\d+): ", stopped.stderr.splitlines()[-1])[1:]
+    name, *options = shlex.split(words)
+    done = command(name, *options, "--max-num-iterations", str(int(start) + 30))
+    table, _, end = done.stdout.partition("Training Finished")
+    header = next(line for line in table.splitlines() if line.startswith("Step (% Done)"))
+    assert header.split("  ")[0] == "Step (% Done)"
+    assert "Loss" in header
+    assert "PSNR (dB)" in header
+    assert "Rays" not in header
+    assert re.match(r"Export it: ssa export-overlay --load-config \S+ --output artifact", end.splitlines()[-1])
+    assert end.splitlines()[-2].startswith("Artifact: ")
+    assert "profiling" not in end
 
 
 def test_tensorboard_gets_the_artifact_as_pictures_and_figures(config):

@@ -4,6 +4,7 @@ Each has a test in tests/plugin/compat that fails on the day upstream no longer 
 overridden method are in the class that overrides it:
 
 - `datamanager`: `cache_images="cpu"` pins memory, which needs CUDA.
+- `first_view`: the viewer opens at a fixed place of its own (`ViewerControl._setup` is where it can be told another).
 - `model.populate_modules`: seed colors are moved to CUDA (splatfacto.py:261).
 - `model.load_state_dict`: makes new Parameters after the optimizers exist, so that a resumed run trains nothing
   (splatfacto.py:392).

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import textwrap
 import zipfile
+import zlib
 from contextlib import AbstractContextManager
 from pathlib import Path
 from pickle import UnpicklingError
@@ -15,7 +17,7 @@ from ssa_nerfstudio.data.writing import staged_files
 PARTIAL = "checkpoint.partial"
 """Folder of a run in which a checkpoint is written; a killed run leaves it behind, and it is never read. It is not in
 the checkpoints' folder, because nerfstudio takes every name there for a checkpoint's."""
-LOAD_ERRORS = (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError)
+LOAD_ERRORS = (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError, OverflowError)
 """What `torch.load` and a state dict raise for a file that is no usable checkpoint."""
 
 
@@ -34,9 +36,17 @@ def damage(checkpoint: Path) -> str | None:
     try:
         with zipfile.ZipFile(checkpoint) as archive:
             wrong = archive.testzip()
-    except (zipfile.BadZipFile, OSError) as error:
-        return str(error)
+    # zipfile raises whatever a broken directory leads it to.
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
+        return str(error) or type(error).__name__
     return None if wrong is None else f"the checksum of {wrong} in it is wrong"
+
+
+def reason(error: Exception) -> str:
+    """Why a checkpoint cannot be loaded, in one line; without torch's advice to load it without its safeguard."""
+    if isinstance(error, UnpicklingError):
+        return "it holds more than tensors and numbers, and loading it might run code"
+    return textwrap.shorten(str(error) or type(error).__name__, 200)
 
 
 def staged_checkpoints(folder: Path) -> AbstractContextManager[Path]:

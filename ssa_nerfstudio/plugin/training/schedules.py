@@ -28,7 +28,6 @@ MODEL_STEPS = (
     "stop_screen_size_at",
     "stop_split_at",
     "mcmc_stop_at",
-    "scene_head_start",
 )
 """Settings of the model that count steps and are scaled; 0 switches one off."""
 
@@ -43,7 +42,7 @@ def scaled(config: Config) -> Config:
     config = copy.deepcopy(config)
     factor = config.max_num_iterations / FULL_LENGTH
     model: Any = config.pipeline.model
-    for name in MODEL_STEPS:
+    for name in (*MODEL_STEPS, *model.own_steps):
         steps = getattr(model, name)
         setattr(model, name, max(1, round(steps * factor)) if steps else 0)  # 0 switches a schedule off
     model.refine_every = max(MIN_REFINE_EVERY, round(model.refine_every * factor))

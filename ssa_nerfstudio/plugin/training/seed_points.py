@@ -1,22 +1,54 @@
-"""The Gaussians that a training starts from."""
+"""Seed points: the Gaussians that a training starts from, and what they say about the space before the cameras."""
 
 from __future__ import annotations
+
+import logging
 
 import torch
 from nerfstudio.models.splatfacto import RGB2SH
 from torch import Tensor
 
+from ssa_nerfstudio.evidence.point_samples import project, regular_subset
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
+
+_LOG = logging.getLogger(__name__)
 
 MIN_DISTANCE = NEAR_PLANE
 """A seed point nearer to a camera than this (world units) is inside it: that camera never draws it."""
+NEAREST_SHARE = 0.001
+"""Share of all projections of seed points that may be nearer than `nearest_depth`: wrong matches."""
+
+
+def nearest_depth(points: Tensor, view_matrices: Tensor, Ks: Tensor, width: int, height: int) -> float | None:
+    """Depth of the nearest seed points in the frames of all cameras, world units; None where no frame shows any.
+
+    Args:
+        points: [N, 3].
+        view_matrices: world to camera [V, 4, 4].
+        Ks: intrinsics [V, 3, 3], pixels.
+        width, height: of the largest frame, pixels.
+    """
+    points = regular_subset(points, len(view_matrices))
+    seen = [project(points, pose, K, height, width)[2] for pose, K in zip(view_matrices, Ks, strict=True)]
+    depths = torch.cat(seen)
+    depths = depths[depths > NEAR_PLANE]
+    return float(depths.kthvalue(1 + int(NEAREST_SHARE * (len(depths) - 1))).values) if len(depths) else None
 
 
 def outside_cameras(means: Tensor, positions: Tensor) -> Tensor:
-    """[N] bool, True where a seed point [N, 3] is inside none of the cameras at positions [V, 3]."""
+    """[N] bool, True where a seed point [N, 3] is inside none of the cameras at positions [V, 3].
+
+    All are True, with a warning, where none would be left.
+    """
     inside = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     for chunk in positions.to(means).split(64):
         inside |= (torch.cdist(means, chunk) < MIN_DISTANCE).any(dim=1)
+    if inside.all():
+        _LOG.warning(
+            f"every seed point is within {MIN_DISTANCE} of a camera, nearer than any is drawn: the scene is too small; "
+            "leave --pipeline.datamanager.dataparser.auto-scale-poses True"
+        )
+        inside.zero_()
     return ~inside
 
 

@@ -75,7 +75,7 @@ def spoil(trainer: SSATrainer, steps: set[int] | range, what: str = "scales", va
 
 def state(trainer: SSATrainer) -> dict[str, Tensor]:
     """Every parameter, every moment and step of Adam, and the densification's sums, copied."""
-    found: dict[str, Tensor] = {**trainer.pipeline.state_dict()}
+    found = {name: value for name, value in trainer.pipeline.state_dict().items() if isinstance(value, Tensor)}
     for group, optimizer in trainer.optimizers.optimizers.items():
         for k, moments in optimizer.state_dict()["state"].items():
             found |= {f"{group}.{k}.{name}": value for name, value in moments.items()}

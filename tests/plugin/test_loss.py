@@ -1,0 +1,134 @@
+"""The terms of the training's loss, each against its formula, and what a step draws and when."""
+
+from __future__ import annotations
+
+import copy
+
+import pytest
+import torch
+
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.photometric import photometric_loss
+from ssa_nerfstudio.overlay.sparsity import sparsity_loss
+from ssa_nerfstudio.plugin.methods import METHODS
+from ssa_nerfstudio.plugin.training.schedules import scaled
+
+
+@pytest.fixture(scope="module")
+def trainer(tiny_scene, tmp_path_factory, configure_training):
+    """A trainer that is set up; no step has been taken."""
+    model = {"overlay": "on", "overlay_start": "constant", "num_downscales": 0, "strategy": "mcmc"}
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path_factory.mktemp("loss"), 100, model)
+    config.set_timestamp()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    return trainer
+
+
+@pytest.fixture
+def model(trainer):
+    """Its model while training, with the settings that a test changes put back."""
+    settings = copy.copy(trainer.pipeline.model.config)
+    overlays = trainer.pipeline.model.artifacts.overlays
+    trainer.pipeline.train()
+    yield trainer.pipeline.model
+    trainer.pipeline.model.config = settings
+    trainer.pipeline.model.artifacts.overlays = overlays
+    trainer.pipeline.model.step = 0
+
+
+SHOWN, PHOTO = (torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
+
+
+def losses(model, **batch) -> dict[str, torch.Tensor]:
+    outputs = {"rgb": torch.zeros(48, 64, 3), "composite": SHOWN, "background": torch.zeros(3)}
+    return model.get_loss_dict(outputs, {"image": PHOTO, **batch})
+
+
+def test_what_a_mask_excludes_is_no_part_of_the_loss(model):
+    mask = torch.ones(48, 64, 1)
+    mask[:, :20] = 0
+    masked = losses(model, mask=mask.bool())["main_loss"]
+    torch.testing.assert_close(masked, photometric_loss(SHOWN * mask, PHOTO * mask, model.config.ssim_lambda))
+    elsewhere = PHOTO.clone()
+    elsewhere[:, :20] = 0.123
+    assert losses(model, image=elsewhere, mask=mask.bool())["main_loss"] == masked
+    assert losses(model)["main_loss"] != masked
+
+
+def test_several_overlays_weigh_as_much_as_one(model):
+    one = losses(model)["sparsity"]
+    weight = model.config.sparsity_weight
+    own = model.artifacts.learned()[0]
+    torch.testing.assert_close(one, weight * sparsity_loss(own.opacity(), own.evidence, "log"))
+    other = ScreenSpaceOverlay(48, 64)
+    with torch.no_grad():
+        other.alpha_logits.add_(3)
+    model.artifacts.overlays = torch.nn.ModuleList([own, other])
+    second = weight * sparsity_loss(other.opacity(), other.evidence, "log")
+    torch.testing.assert_close(losses(model)["sparsity"], (one + second) / 2)
+
+
+def test_mcmc_pays_for_opacity_and_for_size(model):
+    terms = losses(model)
+    torch.testing.assert_close(terms["opacity_reg"], 0.01 * torch.sigmoid(model.opacities).mean())
+    torch.testing.assert_close(terms["mcmc_scale_reg"], 0.01 * torch.exp(model.scales).mean())
+    model.config.strategy = "adc"
+    assert not {"opacity_reg", "mcmc_scale_reg"} & losses(model).keys()
+
+
+def test_long_gaussians_are_penalized_every_tenth_step(model):
+    model.config.use_scale_regularization, model.config.max_gauss_ratio = True, 1.5
+    for step, paid in ((0, True), (9, False), (10, True)):
+        model.step = step
+        assert ("scale_reg" in losses(model)) == paid
+    sizes = torch.exp(model.scales)
+    ratio = sizes.amax(dim=-1) / sizes.amin(dim=-1)
+    torch.testing.assert_close(losses(model)["scale_reg"], 0.1 * (ratio.clamp_min(1.5) - 1.5).mean())
+
+
+def test_harmonics_come_one_degree_at_a_time(model, trainer):
+    camera, _ = trainer.pipeline.datamanager.next_train(0)
+    with torch.no_grad():
+        model.features_rest[:, :3] += 0.5  # of degree 1 alone
+    model.config.sh_degree_interval = 10
+
+    def drawn(step: int) -> torch.Tensor:
+        model.step_cb(trainer.optimizers, step)
+        torch.manual_seed(0)  # of the background
+        return model.get_outputs(camera)["rgb"]
+
+    constant, first, everything = drawn(9), drawn(10), drawn(1000)
+    with torch.no_grad():
+        model.features_rest[:, :3] -= 0.5
+    assert not torch.equal(constant, first)
+    torch.testing.assert_close(first, everything)
+
+
+def test_every_view_is_drawn_once_before_any_comes_again(trainer):
+    manager = trainer.pipeline.datamanager
+    manager.train_unseen_cameras = manager.sample_train_cameras()
+    for _ in range(2):
+        drawn = [manager.next_train(step)[1]["image_idx"] for step in range(12)]
+        assert sorted(drawn) == list(range(12))
+
+
+@pytest.mark.parametrize("steps", [3_000, 15_000, 60_000])
+def test_the_means_rate_follows_the_length(steps):
+    config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    config.max_num_iterations = steps
+    found = scaled(config)
+    assert found.optimizers["means"]["scheduler"].max_steps == steps
+
+
+def test_the_means_rates_are_in_units_of_the_scene(trainer):
+    before = {name: copy.deepcopy(entry) for name, entry in trainer.config.optimizers.items()}
+    try:
+        trainer.pipeline.model.scene_scale = 2.5  # as `scale_by_extent` sets it
+        trainer.setup_optimizers()
+        means = trainer.config.optimizers["means"]
+        assert means["optimizer"].lr == pytest.approx(2.5 * before["means"]["optimizer"].lr)
+        assert means["scheduler"].lr_final == pytest.approx(2.5 * before["means"]["scheduler"].lr_final)
+    finally:
+        trainer.pipeline.model.scene_scale = 1.0
+        trainer.config.optimizers = before
