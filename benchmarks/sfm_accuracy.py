@@ -152,7 +152,9 @@ class Command:
                 os.link(capture / path, photos / Path(path).name)
             for row in asked:
                 flatten, filter_stationary, mask = WAYS[row["way"]]
-                settings = SfmSettings("exhaustive", self.max_image_size, flatten, filter_stationary, self.threads)
+                settings = SfmSettings(
+                    "exhaustive", self.max_image_size, flatten, filter_stationary, threads=self.threads
+                )
                 used = _open_part(capture / "layers/raw.npz") if mask == "true" else None
                 result = json.dumps(row | measure(photos, used, mask == "detected", settings, true))
                 print(result, flush=True)

@@ -9,17 +9,19 @@ import json
 import os
 import shutil
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, saving a PNG aborts the process
 import pycolmap
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
 from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
+from ssa_nerfstudio.sfm.known_poses import align, triangulate
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
-from ssa_nerfstudio.sfm.reconstruction import JOB, MODEL, Pass, SfmSettings
+from ssa_nerfstudio.sfm.reconstruction import JOB, KEPT, MODEL, Mount, Pass, SfmSettings
 
 _PAIRS_PER_CALL = 64
 """Pairs that are matched and stored at once: the loss when the process is killed, and the grain of the progress bar."""
@@ -44,7 +46,7 @@ class StructureFromMotion:
         self._database = folder / "database.db"
 
     def extract(self, on_progress: ProgressCallback) -> None:
-        """Extract SIFT features of all photos that have none yet; one OPENCV camera per pass."""
+        """Extract SIFT features of all photos that have none yet; one camera per pass; and build the rigs."""
         options = pycolmap.FeatureExtractionOptions()
         options.num_threads = self._settings.threads
         options.max_image_size = self._settings.max_image_size
@@ -53,13 +55,16 @@ class StructureFromMotion:
             done = {image.name for image in database.read_all_images() if database.exists_keypoints(image.image_id)}
         for number, each in enumerate(self._passes, 1):
             reader = pycolmap.ImageReaderOptions()
-            reader.camera_model = "OPENCV"
+            reader.camera_model = self._settings.camera_model
             if each.mask is not None:
                 reader.camera_mask_path = each.mask
             with pycolmap.Database.open(self._database) as database:
                 if not database.exists_camera(number):
                     camera = pycolmap.infer_camera_from_image(self._images / each.photos[0], reader)
                     camera.camera_id = number
+                    if each.lens is not None:
+                        camera.params = each.lens
+                        camera.has_prior_focal_length = True
                     database.write_camera(camera, use_camera_id=True)
             reader.existing_camera_id = number
             remaining = iter([name for name in each.photos if name not in done])
@@ -73,12 +78,14 @@ class StructureFromMotion:
                     extraction_options=options,
                 )
                 done |= {*names}
+        self._build_rigs()
         on_progress("features", total, total)
 
     def match(self, on_progress: ProgressCallback) -> None:
         """Match all pairs that have not been matched yet, and verify the matches geometrically."""
         matching = pycolmap.FeatureMatchingOptions()
         matching.num_threads = self._settings.threads
+        matching.skip_image_pairs_in_same_frame = True
         geometry = pycolmap.TwoViewGeometryOptions()
         geometry.filter_stationary_matches = self._settings.filter_stationary
         geometry.ransac.random_seed = 0
@@ -87,6 +94,8 @@ class StructureFromMotion:
         pairs = self._pairs()
         with pycolmap.Database.open(self._database) as database:
             ids = {image.name: image.image_id for image in database.read_all_images()}
+            frame = {image.name: image.frame_id for image in database.read_all_images()}
+            pairs = [pair for pair in pairs if frame[pair[0]] != frame[pair[1]]]
             remaining = [pair for pair in pairs if not database.exists_two_view_geometry(*(ids[n] for n in pair))]
         done = len(pairs) - len(remaining)
         batches = iter(remaining)
@@ -97,33 +106,67 @@ class StructureFromMotion:
             done += len(batch)
         on_progress("matches", len(pairs), len(pairs))
 
-    def map(self, on_progress: ProgressCallback) -> None:
-        """Map incrementally and store the model of most photos; none where no two photos match."""
+    def map(self, on_progress: ProgressCallback, poses: Mapping[str, np.ndarray]) -> None:
+        """Map incrementally and store the model of most photos; none where no two photos match.
+
+        Args:
+            on_progress: called after every photo.
+            poses: those that are known; those that agree with the photos are where the mapping starts.
+        """
         total = sum(len(each.photos) for each in self._passes)
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = self._settings.threads
         options.random_seed = 0
         # COLMAP's default would drop the complete model of a capture of few photos.
         options.min_model_size = min(10, max(3, total // 2))
+        # What is known stays as it is.
+        options.constant_cameras = {number for number, each in enumerate(self._passes, 1) if each.mount is not None}
+        options.ba_refine_sensor_from_rig = False
         models = self._folder / "models"
         for earlier in (models, self._folder / MODEL):
             shutil.rmtree(earlier, ignore_errors=True)
         models.mkdir()
-        registered = 2
+        kept = triangulate(self._database, self._images, poses, start := models / "start") if poses else set()
+        (self._folder / KEPT).write_text(json.dumps(sorted(kept)), encoding="utf-8")
+        rigs = {number if each.mount is None else each.mount.rig for number, each in enumerate(self._passes)}
+        at_once = len(self._passes) // len(rigs)
+        registered = len(kept) or 2 * at_once
 
         def on_registered() -> None:
             nonlocal registered
-            registered += 1
+            registered += at_once
             on_progress("poses", min(registered, total), total)
 
         on_progress("poses", 0, total)
         found = pycolmap.incremental_mapping(
-            self._database, self._images, models, options, next_image_callback=on_registered
+            *(self._database, self._images, models, options),
+            input_path=start if kept else "",
+            next_image_callback=on_registered,
         )
         if found:
+            model = max(found.values(), key=lambda model: model.num_reg_images())
+            if kept:
+                align(model, {name: poses[name] for name in kept})
             (self._folder / MODEL).mkdir()
-            max(found.values(), key=lambda model: model.num_reg_images()).write_binary(self._folder / MODEL)
+            model.write_binary(self._folder / MODEL)
         on_progress("poses", total, total)
+
+    def _build_rigs(self) -> None:
+        """Join cameras whose places on a rig are known."""
+        mounts = [each.mount for each in self._passes if each.mount is not None]
+        configs = []
+        for rig in dict.fromkeys(mount.rig for mount in mounts):
+            members = [mount for mount in mounts if mount.rig == rig]
+            first = np.array(members[0].from_rig)
+            cameras = [pycolmap.RigConfigCamera(image_prefix=members[0].prefix, ref_sensor=True)]
+            for mount in members[1:]:
+                turn = pycolmap.Rotation3d(np.array(mount.from_rig) @ first.T)
+                pose = pycolmap.Rigid3d(turn, np.zeros(3))
+                cameras.append(pycolmap.RigConfigCamera(image_prefix=mount.prefix, cam_from_rig=pose))
+            configs.append(pycolmap.RigConfig(cameras=cameras))
+        if configs:
+            with pycolmap.Database.open(self._database) as database:
+                pycolmap.apply_rig_config(configs, database)
 
     def _pairs(self) -> list[tuple[str, str]]:
         photos = [each.photos for each in self._passes]
@@ -145,11 +188,11 @@ def _main(folder: Path) -> None:
 
     end_with_parent()
     job = json.loads((folder / JOB).read_text(encoding="utf-8"))
-    passes = [Pass(**each) for each in job["passes"]]
+    passes = [Pass(**each | {"mount": each["mount"] and Mount(**each["mount"])}) for each in job["passes"]]
     sfm = StructureFromMotion(Path(job["images"]), passes, folder, SfmSettings(**job["settings"]))
     sfm.extract(on_progress)
     sfm.match(on_progress)
-    sfm.map(on_progress)
+    sfm.map(on_progress, {name: np.array(pose) for name, pose in job["poses"].items()})
 
 
 if __name__ == "__main__":

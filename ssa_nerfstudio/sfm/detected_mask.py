@@ -1,14 +1,19 @@
-"""A mask of the opaque artifact that detection finds in the photos of a pass."""
+"""What detection says about masks: of the opaque artifact that it finds in the photos of a pass, and of the user's."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from ssa_nerfstudio.data.photos import read_photo
+from ssa_nerfstudio.errors import InputError
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 _SIZE = 960
 """Longest side to which photos are reduced for detection, pixels: twice its working resolution."""
@@ -26,9 +31,51 @@ def detected_mask(photos: Sequence[Path], advance: Callable[[int], None]) -> np.
     Returns:
         bool [H, W] of the photos' size, True where features may lie; None where no opaque artifact is found.
     """
+    from ssa_nerfstudio.evidence.detection import detect
+
+    statistics, size = _statistics(photos, advance)
+    found = detect(statistics)
+    if found.verdict != "opaque":
+        return None
+    return cv2.resize((~found.mask).numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+
+
+def has_artifact(photos: Sequence[Path]) -> bool:
+    """Whether photos of one size, in the order of the capture, show a static artifact, opaque or not.
+
+    Photos that cannot be tested, such as transparent ones, may show one.
+    """
+    from ssa_nerfstudio.evidence.detection import detect
+
+    try:
+        statistics, _ = _statistics(photos, lambda _: None)
+    except InputError:
+        return True
+    return detect(statistics).verdict != "none"
+
+
+def check_mask_polarity(mask: np.ndarray, photos: Sequence[Path], advance: Callable[[int], None]) -> None:
+    """Check that a mask does not keep the artifact that is detected, instead of leaving it out.
+
+    Args:
+        mask: bool [H, W], True where features may lie.
+        photos, advance: as for `detected_mask`.
+
+    Raises:
+        InputError: it certainly does; where that is only likely, a warning is logged.
+    """
+    from ssa_nerfstudio.evidence.mask_polarity import check_polarity
+
+    statistics, _ = _statistics(photos, advance)
+    height, width = statistics.size
+    reduced = cv2.resize(mask.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
+    check_polarity(reduced, statistics, "--mask", "invert it with --invert-mask: black is ignored")
+
+
+def _statistics(photos: Sequence[Path], advance: Callable[[int], None]) -> tuple[ImageStatistics, tuple[int, int]]:
+    """Statistics of reduced photos, and the width and height of the photos themselves."""
     import torch
 
-    from ssa_nerfstudio.evidence.detection import detect
     from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
     statistics = ImageStatistics()
@@ -41,7 +88,4 @@ def detected_mask(photos: Sequence[Path], advance: Callable[[int], None]) -> np.
             photo = cv2.resize(photo, reduced, interpolation=cv2.INTER_AREA)
         statistics.add(torch.from_numpy(photo))
         advance(number)
-    found = detect(statistics)
-    if found.verdict != "opaque":
-        return None
-    return cv2.resize((~found.mask).numpy().astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
+    return statistics, size

@@ -20,8 +20,8 @@ def sequential_pairs(passes: Sequence[Sequence[str]]) -> list[tuple[str, str]]:
     """Pairs of photos that are near in time, and of keyframes that are not.
 
     Every photo is paired with the 10 that follow it in its pass and with those 16, 32, ..., 512 further on. In addition
-    60 evenly spaced keyframes of each pass are paired with each other, also across passes: they close loops and connect
-    the passes, without a vocabulary tree.
+    evenly spaced keyframes of each pass (60, of more than two passes 150 together) are paired with each other, also
+    across passes: they close loops and connect the passes, without a vocabulary tree.
 
     Args:
         passes: each pass's photos in order.
@@ -34,7 +34,8 @@ def sequential_pairs(passes: Sequence[Sequence[str]]) -> list[tuple[str, str]]:
     for photos in passes:
         for step in steps:
             pairs.update(dict.fromkeys(zip(photos, photos[step:], strict=False)))
-    keyframes = [_keyframes(photos) for photos in passes]
+    most = min(_MAX_KEYFRAMES, EXHAUSTIVE_UP_TO // max(1, len(passes)))
+    keyframes = [_keyframes(photos, most) for photos in passes]
     for each in keyframes:
         pairs.update(dict.fromkeys(combinations(each, 2)))
     for one, other in combinations(keyframes, 2):
@@ -42,7 +43,7 @@ def sequential_pairs(passes: Sequence[Sequence[str]]) -> list[tuple[str, str]]:
     return list(pairs)
 
 
-def _keyframes(photos: Sequence[str]) -> list[str]:
-    """At most 60 photos, evenly spaced, the first and the last among them."""
-    count = min(_MAX_KEYFRAMES, len(photos))
+def _keyframes(photos: Sequence[str], most: int) -> list[str]:
+    """At most so many photos, evenly spaced, the first and the last among them."""
+    count = min(most, len(photos))
     return [photos[round(number * (len(photos) - 1) / max(count - 1, 1))] for number in range(count)]

@@ -4,13 +4,16 @@ them."""
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import PIL.Image
 
+from ssa_nerfstudio.data.panorama_entry import panorama_entry
+from ssa_nerfstudio.data.sources import Source
+from ssa_nerfstudio.data.sparse_points import write_points
 from ssa_nerfstudio.sfm.ingest import Photo, remove_records
 
 if TYPE_CHECKING:
@@ -22,29 +25,44 @@ POINTS = "sparse_pc.ply"
 """File of the points."""
 MASK = "mask_colmap.png"
 """File of the mask of the first pass: black is ignored, as by COLMAP and nerfstudio."""
-_INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2")
+_INTRINSICS = {
+    "OPENCV": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
+"""COLMAP's parameters by the model that they are of."""
 
 
 def write_dataset(
-    dataset: Path, photos: Sequence[Sequence[Photo]], model: pycolmap.Reconstruction, mask: np.ndarray | None
+    dataset: Path,
+    photos: Sequence[Photo],
+    tests: Set[str],
+    model: pycolmap.Reconstruction,
+    masks: Sequence[Path],
+    panoramas: Source | None = None,
 ) -> None:
     """Complete a dataset that has its photos already; transforms.json comes last.
 
     Args:
         dataset: folder that holds images/.
-        photos: the photos of each pass, those of the first train and those of a second test.
+        photos: all of them.
+        tests: names of those that test; without any, no split is stated.
         model: their reconstruction.
-        mask: bool [height, width] of the first pass, True where features could lie; None: no file is written.
+        masks: files of the masks that were used, to copy.
+        panoramas: equirectangular photos whose faces the photos are.
     """
     sparse = dataset / "colmap" / "sparse" / "0"
     sparse.mkdir(parents=True, exist_ok=True)
     model.write_binary(sparse)
-    write_points(dataset / POINTS, model)
-    if mask is not None:
-        PIL.Image.fromarray(mask).save(dataset / MASK)
-    meta = transforms(model, {photo.name: photo.source for each in photos for photo in each})
-    if len(photos) > 1:
-        meta = split(meta, *([photo.name for photo in each] for each in photos))
+    points = list(model.points3D.values())
+    positions = np.array([point.xyz for point in points]).reshape(-1, 3) @ APPLIED_TRANSFORM[:, :3].T
+    write_points(dataset / POINTS, positions, np.array([point.color for point in points]).reshape(-1, 3))
+    for mask in masks:
+        shutil.copy(mask, dataset)
+    meta = transforms(model, {photo.name: photo.source for photo in photos})
+    if tests:
+        meta = split(meta, [p.name for p in photos if p.name not in tests], [p.name for p in photos if p.name in tests])
+    if panoramas is not None:
+        meta |= panorama_entry(panoramas.width, panoramas.faces)
     remove_records(dataset)
     (dataset / "transforms.json").write_text(json.dumps(meta, indent=1), encoding="utf-8")
 
@@ -56,7 +74,7 @@ def transforms(reconstruction: pycolmap.Reconstruction, sources: Mapping[str, st
     in `nerfstudio.process_data.colmap_utils.colmap_to_json`.
 
     Args:
-        reconstruction: its cameras are of model OPENCV.
+        reconstruction: its cameras are of one model, OPENCV or OPENCV_FISHEYE.
         sources: for each photo the file that it was made from.
     """
     cameras = {number: _intrinsics(camera) for number, camera in reconstruction.cameras.items()}
@@ -73,7 +91,7 @@ def transforms(reconstruction: pycolmap.Reconstruction, sources: Mapping[str, st
         for image in images
     ]
     return {
-        "camera_model": "OPENCV",
+        "camera_model": reconstruction.cameras[images[0].camera_id].model.name,
         **shared,
         "applied_transform": APPLIED_TRANSFORM.tolist(),
         "ply_file_path": POINTS,
@@ -93,19 +111,6 @@ def split(meta: dict[str, Any], train: Sequence[str], test: Sequence[str]) -> di
     return {**meta, "train_filenames": lists[0], "val_filenames": lists[1], "test_filenames": lists[1]}
 
 
-def write_points(path: Path, reconstruction: pycolmap.Reconstruction) -> None:
-    """Write the points in nerfstudio's world as binary PLY: float x, y, z and uchar red, green, blue."""
-    points = list(reconstruction.points3D.values())
-    table = np.empty(len(points), dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3)])
-    if points:
-        table["xyz"] = np.array([point.xyz for point in points]) @ APPLIED_TRANSFORM[:, :3].T
-        table["rgb"] = np.array([point.color for point in points])
-    properties = [f"property float {axis}" for axis in "xyz"]
-    properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *properties, "end_header", ""]
-    path.write_bytes("\n".join(header).encode() + table.tobytes())
-
-
 def _pose(image: pycolmap.Image) -> np.ndarray:
     pose = np.eye(4)
     pose[:3] = image.cam_from_world().inverse().matrix()
@@ -114,4 +119,5 @@ def _pose(image: pycolmap.Image) -> np.ndarray:
 
 
 def _intrinsics(camera: pycolmap.Camera) -> dict[str, float]:
-    return {"w": camera.width, "h": camera.height, **dict(zip(_INTRINSICS, map(float, camera.params), strict=True))}
+    names = _INTRINSICS[camera.model.name]
+    return {"w": camera.width, "h": camera.height, **dict(zip(names, map(float, camera.params), strict=True))}

@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import PIL.Image
-from rich.console import Console
 
+from ssa_nerfstudio.cameras.groups import same_intrinsics
+from ssa_nerfstudio.cameras.panorama import cut
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.sfm.detected_mask import detected_mask
+from ssa_nerfstudio.sfm.detected_mask import check_mask_polarity, detected_mask, has_artifact
+from ssa_nerfstudio.sfm.existing_model import ExistingModel
 from ssa_nerfstudio.sfm.feature_mask import widened
+from ssa_nerfstudio.sfm.fisheye_guess import fisheye_guess
 from ssa_nerfstudio.sfm.flat_field import MIN_PHOTOS, static_factor, write_flattened
 from ssa_nerfstudio.sfm.ingest import Photo, expected_count, ingest
+from ssa_nerfstudio.sfm.model_repair import Repair
 from ssa_nerfstudio.sfm.nerfstudio_dataset import MASK, write_dataset
-from ssa_nerfstudio.sfm.progress_display import ProgressCallback, progress_display
-from ssa_nerfstudio.sfm.reconstruction import Pass, SfmSettings, reconstruct
-from ssa_nerfstudio.sfm.registration import PassRegistration, check_registrations, registrations
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+from ssa_nerfstudio.sfm.reconstruction import KEPT, Mount, Pass, SfmSettings, reconstruct
+from ssa_nerfstudio.sfm.registration import PassRegistration, check_lenses, check_registrations, registrations
 from ssa_nerfstudio.sfm.work_folder import resumable_work
 
 if TYPE_CHECKING:
     import pycolmap
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -33,13 +42,15 @@ class Summary:
     """What processing found."""
 
     passes: tuple[PassRegistration, ...]
-    """Registration of each pass, the training photos first."""
+    """Registration of each camera's training photos, then of the clean pass."""
     points: int
     """Number of 3D points."""
     reprojection_error: float
     """Mean over the points' observations, pixels of the photos."""
     masked: float
-    """Share of the first pass's frame that is masked, in [0, 1]."""
+    """Share of the training photos' frames that is masked, mean over the cameras, in [0, 1]."""
+    repair: Repair | None = None
+    """What became of the model that there was."""
 
 
 def process(
@@ -47,57 +58,105 @@ def process(
     output: Path,
     mask: np.ndarray | None = None,
     detect: bool = False,
+    clean: Source | None = None,
     frames: int = 200,
     min_registered: float = 0.5,
     settings: SfmSettings | None = None,
-    console: Console | None = None,
+    known: ExistingModel | None = None,
+    on_progress: ProgressCallback = lambda part, done, total: None,
 ) -> Summary:
     """Write a nerfstudio dataset: images/, transforms.json, sparse_pc.ply and COLMAP's model in colmap/sparse/0.
 
-    All passes are mapped together, each with a camera of its own. Where there are two, the photos of the first train
-    and those of the second test. The output appears only when it is complete. Until then work lies in `.NAME.work`
+    All are mapped together, each with a camera of its own. Where there is a clean pass, it tests and all others train.
+    The output appears only when it is complete. Until then work lies in `.NAME.work`
     beside it, from which the next run with the same arguments continues.
 
     Args:
-        sources: the passes, one or two, the one to train on first.
+        sources: the cameras to train on.
         output: folder to make.
-        mask: bool [height, width] for the first pass, True where features may lie.
-        detect: whether to detect an opaque artifact in the first pass and mask it, where no mask is given.
-        frames: number of frames to take from a pass of videos, at least 1.
+        mask: bool [height, width] for the only source, True where features may lie; of equirectangular photos, whole.
+        detect: whether to detect an opaque artifact of each camera and mask it, where no mask is given.
+        clean: a pass of the same scene without the artifact, to test on.
+        frames: number of frames to take from videos of a camera, at least 1.
         min_registered: required share of registered photos of each pass, in [0, 1].
         settings: settings of structure from motion.
-        console: where progress is shown.
+        known: a model of the photos of `sources`, which are its own; the photos are registered to what holds of it.
+        on_progress: called with how far each part is.
 
     Raises:
-        InputError: a photo is broken, too few were registered, or the output cannot be written.
+        InputError: a photo is broken, the mask keeps the artifact alone, too few photos were registered, or the output
+            cannot be written.
     """
     settings = settings or SfmSettings()
-    mask = None if mask is None else widened(mask)
-    with resumable_work(output) as work, progress_display(console or Console()) as on_progress:
-        inputs = [(source.name, source.fingerprint(), frames) for source in sources]
+    cameras = [camera for source in sources for camera in source.cameras]
+    train, sources = len(cameras), [*sources, *([clean] if clean is not None else [])]
+    names = [camera.name for source in sources for camera in source.cameras]
+    masks: list[np.ndarray | None] = [None] * train
+    if mask is not None:
+        masks = [mask if face is None else cut(mask.astype(np.float32), face) > 0.5 for _, face in cameras]
+        masks = [widened(each) for each in masks if each is not None]
+    with resumable_work(output) as work:
+        inputs = [(*(camera.name for camera in source.cameras), source.fingerprint(), frames) for source in sources]
         dataset = work.subfolder("dataset", inputs)
         photos = _ingest_all(sources, dataset, frames, on_progress)
-        if detect and mask is None:
-            files = [dataset / "images" / photo.name for photo in photos[0]]
-            mask = detected_mask(files, lambda done: on_progress("detection", done, len(files)))
-            mask = None if mask is None else widened(mask)
-        motion = work.subfolder("motion", [inputs, _digest(mask), asdict(settings) | {"threads": None}])
-        passes = _passes(photos, dataset / "images", motion, mask, settings, on_progress)
-        found = reconstruct(dataset / "images", passes, motion, settings, on_progress)
+        if mask is not None:
+            for used, each in zip(masks, photos, strict=False):
+                assert used is not None
+                check_mask_polarity(used, *_detection(dataset, each, on_progress))
+        elif detect:
+            masks = [_detected(dataset, photos[number], on_progress) for number in range(train)]
+        poses = {} if known is None else _poses(known, photos)
+        start = [known and known.lenses, *((name, pose.tolist()) for name, pose in poses.items())]
+        asked = [inputs, [*map(_digest, masks)], asdict(settings) | {"threads": None}, start]
+        motion = work.subfolder("motion", asked)
+        passes = _passes(sources, photos, dataset / "images", motion, masks, settings, on_progress)
+        if known is not None:
+            passes[:train] = [replace(each, lens=lens) for each, lens in zip(passes, known.lenses, strict=False)]
+        found = reconstruct(dataset / "images", passes, motion, settings, on_progress, poses)
         model = found and _load(found)
-        registered = registrations([source.name for source in sources], photos, model)
+        registered = registrations(names, photos, model)
         try:
-            check_registrations(registered, min_registered, masked=mask is not None)
+            detected = "detection" if any(each is not None for each in masks) else None
+            check_registrations(registered, min_registered, "user" if mask is not None else detected)
         except InputError as error:
             work.keep_after_error = True
             remedy = f"{error.remedy}; a run that requires fewer continues from the work in {work.path}"
             raise InputError(error.problem, remedy) from error
         assert model is not None
-        write_dataset(dataset, photos, model, mask)
+        check_lenses(names, model)
+        files = [photo for each in photos for photo in each]
+        tests = {photo.name for each in photos[train:] for photo in each}
+        used = [Path(each.mask) for each in passes if each.mask]
+        write_dataset(dataset, files, tests, model, used, sources[0] if sources[0].faces else None)
+        _warn_of_equal_cameras(model, names[:train])
+        repair = None
+        if known is not None:
+            kept = {*json.loads((motion / KEPT).read_text(encoding="utf-8"))}
+            now = {image.name for image in model.images.values() if image.has_pose}
+            repair = Repair.of(known, photos[:train], masks, kept, now)
         dataset.rename(output)
         work.remove()
-    masked = 0.0 if mask is None else float(1 - mask.mean())
-    return Summary(registered, model.num_points3D(), model.compute_mean_reprojection_error(), masked)
+    masked = float(np.mean([0.0 if mask is None else 1 - mask.mean() for mask in masks]))
+    return Summary(registered, model.num_points3D(), model.compute_mean_reprojection_error(), masked, repair)
+
+
+def _poses(known: ExistingModel, photos: Sequence[Sequence[Photo]]) -> dict[str, np.ndarray]:
+    """The poses of the model by the names that the photos have in the dataset."""
+    files = [file for source in known.sources for file in source.photos]
+    names = [photo.name for each in photos[: len(known.sources)] for photo in each]
+    return {n: known.photos[file].pose for n, file in zip(names, files, strict=True) if file in known.photos}
+
+
+def _warn_of_equal_cameras(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:
+    """Training tells cameras apart by their frames and intrinsics alone."""
+    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    lenses = {number: np.array([c.width, c.height, *c.params[:4]]) for number, c in model.cameras.items()}
+    for one, other in combinations(sorted(used & {*range(1, len(names) + 1)}), 2):
+        if (lenses[one][:2] == lenses[other][:2]).all() and same_intrinsics(lenses[one], lenses[other]):
+            _LOG.warning(
+                f"the cameras {names[one - 1]} and {names[other - 1]} have nearly the same intrinsics, and training "
+                "takes them for one with one overlay; where their artifacts differ, process and train them one by one"
+            )
 
 
 def _ingest_all(
@@ -112,26 +171,54 @@ def _ingest_all(
         on_progress("photos", min(done, total), total)
 
     on_progress("photos", 0, total)
-    photos = [ingest(source, dataset, frames, advance) for source in sources]
+    photos = [camera for source in sources for camera in ingest(source, dataset, frames, advance)]
     on_progress("photos", total, total)
     return photos
 
 
+def _detected(dataset: Path, photos: Sequence[Photo], on_progress: ProgressCallback) -> np.ndarray | None:
+    mask = detected_mask(*_detection(dataset, photos, on_progress))
+    return None if mask is None else widened(mask)
+
+
+def _detection(
+    dataset: Path, photos: Sequence[Photo], on_progress: ProgressCallback
+) -> tuple[list[Path], Callable[[int], None]]:
+    """What detection reads, and where it says how far it is."""
+    files = [dataset / "images" / photo.name for photo in photos]
+    return files, lambda done: on_progress("detection", done, len(files))
+
+
 def _passes(
+    sources: Sequence[Source],
     photos: Sequence[Sequence[Photo]],
     images: Path,
     folder: Path,
-    mask: np.ndarray | None,
+    masks: Sequence[np.ndarray | None],
     settings: SfmSettings,
     on_progress: ProgressCallback,
 ) -> list[Pass]:
-    """Where features of each pass are extracted: the first pass has a mask and flattened copies, if there are any."""
-    passes = [Pass([photo.name for photo in each], str(images)) for each in photos]
-    if mask is not None:
-        PIL.Image.fromarray(mask).save(folder / MASK)
-    names = passes[0].photos
-    copies = _flatten(names, images, folder / "flat", settings, on_progress)
-    return [Pass(names, str(copies), None if mask is None else str(folder / MASK)), *passes[1:]]
+    """Where features of each pass are extracted: those that train have flattened copies, and masks where there are."""
+    passes = []
+    cameras = [(source, camera) for source in sources for camera in source.cameras]
+    for number, ((source, camera), each) in enumerate(zip(cameras, photos, strict=True)):
+        names = [photo.name for photo in each]
+        mount, lens = None, None
+        if (face := camera.face) is not None:
+            mount = Mount(source.name, f"{camera.name}_", face.from_panorama.tolist())
+            lens = [face.focal, face.focal, face.size / 2, face.size / 2, 0.0, 0.0, 0.0, 0.0]
+        elif settings.camera_model == "OPENCV_FISHEYE":
+            lens = fisheye_guess([images / name for name in names])
+        if number >= len(masks):
+            passes.append(Pass(names, str(images), None, lens, mount))
+            continue
+        copies = _flatten(names, images, folder / "flat", settings, on_progress)
+        file = None
+        if (mask := masks[number]) is not None:
+            file = str(folder / (MASK if len(masks) == 1 else f"{Path(MASK).stem}_{camera.name}.png"))
+            PIL.Image.fromarray(mask).save(file)
+        passes.append(Pass(names, str(copies), file, lens, mount))
+    return passes
 
 
 def _flatten(
@@ -143,7 +230,9 @@ def _flatten(
     done = sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
     if done < len(names):
         on_progress("artifact", 0, len(names))
-        factor = static_factor([images / name for name in names], settings.max_image_size)
+        files = [images / name for name in names]
+        # A walk straight ahead has static edges of its own, which belong to the scene.
+        factor = static_factor(files, settings.max_image_size) if has_artifact(files) else None
         if factor is None:
             on_progress("artifact", len(names), len(names))
             return images

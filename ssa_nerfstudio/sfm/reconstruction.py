@@ -11,17 +11,33 @@ import json
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
+
+import numpy as np
 
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 
 MODEL = "model"
 """Folder of the chosen model, in COLMAP's binary files; missing where none was found."""
+KEPT = "kept.json"
+"""File with the names of the photos whose known poses were kept."""
 JOB = "job.json"
 """File with the child's arguments."""
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera on a rig whose cameras are all in one place."""
+
+    rig: str
+    """Name of the rig."""
+    prefix: str
+    """How its photos' names begin; what follows is the same for photos of the rig that were taken at once."""
+    from_rig: list[list[float]]
+    """Rotation [3, 3] of directions from the rig's axes to the camera's."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +50,10 @@ class Pass:
     """Folder in which features are extracted: the photos, or copies of the same names and size."""
     mask: str | None = None
     """File of a mask, black where no feature may lie; None: features may lie everywhere."""
+    lens: list[float] | None = None
+    """fx, fy, cx, cy, k1, k2, p1, p2 to start from; None: as COLMAP guesses from the photos."""
+    mount: Mount | None = None
+    """Of a camera on a rig, whose `lens` stays as it is; None: each photo's pose is its own."""
 
 
 @dataclass(frozen=True)
@@ -48,12 +68,19 @@ class SfmSettings:
     """Whether features of the first pass are extracted in photos without their static factor (`flat_field`)."""
     filter_stationary: bool = True
     """Whether matches at the same place of both frames (within 4 pixels) are dropped."""
+    camera_model: Literal["OPENCV", "OPENCV_FISHEYE"] = "OPENCV"
+    """Lens model of all photos."""
     threads: int = -1
     """Number of threads; -1: one per core."""
 
 
 def reconstruct(
-    images: Path, passes: Sequence[Pass], folder: Path, settings: SfmSettings, on_progress: ProgressCallback
+    images: Path,
+    passes: Sequence[Pass],
+    folder: Path,
+    settings: SfmSettings,
+    on_progress: ProgressCallback,
+    poses: Mapping[str, np.ndarray] | None = None,
 ) -> Path | None:
     """Extract features, match and map in a child process that ends with this one, even when this one is killed.
 
@@ -63,6 +90,8 @@ def reconstruct(
         folder: exists; what an earlier run left there is used.
         settings: settings of structure from motion.
         on_progress: called with what the child reports.
+        poses: those that are known, camera from world [3, 4], by the photo's name. The folder's KEPT then lists the
+            photos that agree with theirs, and the model is where those were.
 
     Returns:
         The folder of the model, or None where no two photos match.
@@ -72,6 +101,7 @@ def reconstruct(
         OSError: the child ended abnormally, which is how COLMAP reports that it cannot write.
     """
     job = {"images": str(images), "passes": [asdict(each) for each in passes], "settings": asdict(settings)}
+    job["poses"] = {name: pose.tolist() for name, pose in (poses or {}).items()}
     (folder / JOB).write_text(json.dumps(job), encoding="utf-8")
     log = folder / "log.txt"
     with log.open("w") as errors:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
+from ssa_nerfstudio.cameras.lens import Lens, undistorted_lens
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.ingest import Photo
 
@@ -53,13 +54,15 @@ def registrations(
     )
 
 
-def check_registrations(passes: Sequence[PassRegistration], min_share: float, masked: bool) -> None:
+def check_registrations(
+    passes: Sequence[PassRegistration], min_share: float, masked_by: Literal["user", "detection"] | None
+) -> None:
     """Check that enough photos of every pass are registered.
 
     Args:
         passes: from `registrations`.
         min_share: required share of the photos of each pass, in [0, 1]; at least one photo is needed.
-        masked: whether an artifact has been masked, so that a mask is no remedy.
+        masked_by: who has masked an artifact, so that another mask is no remedy; None where none is masked.
 
     Raises:
         InputError: a pass has fewer.
@@ -67,10 +70,38 @@ def check_registrations(passes: Sequence[PassRegistration], min_share: float, ma
     for each in passes:
         if each.share < min_share or each.count == 0:
             remedy = "take photos that overlap more"
-            if not masked:
+            if masked_by is None:
                 remedy = f"mask what covers part of every frame, or {remedy}"
+            elif masked_by == "user":
+                remedy = f"look whether the mask is black on the artifact (else --invert-mask), or {remedy}"
             raise InputError(
                 f"only {each.count} of {each.photos} {each.name} photos could be registered, {min_share:.0%} are "
                 "required",
                 remedy,
             )
+
+
+def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
+    """Check that the lenses that were estimated can be undistorted, which training does first.
+
+    Args:
+        names: of the passes, whose cameras are numbered from 1.
+        model: the reconstruction; its cameras are of model OPENCV or OPENCV_FISHEYE.
+
+    Raises:
+        InputError: one cannot.
+    """
+    for number in sorted({image.camera_id for image in model.images.values() if image.has_pose}):
+        camera = model.cameras[number]
+        fx, fy, cx, cy, k1, k2, *others = map(float, camera.params)
+        fisheye = camera.model.name == "OPENCV_FISHEYE"
+        distortion = (k1, k2, *others, 0.0, 0.0) if fisheye else (k1, k2, 0.0, 0.0, *others)
+        size, kind = (camera.width, camera.height), "fisheye" if fisheye else "perspective"
+        try:
+            undistorted_lens(Lens(*size, fx, fy, cx, cy, distortion, kind))
+        except InputError as error:
+            raise InputError(
+                f"the lens that structure from motion estimates for the {names[number - 1]} photos is none "
+                f"(k1 = {k1:.2g}, k2 = {k2:.2g}): their poses are wrong",
+                "take photos from more directions, that overlap more",
+            ) from error

@@ -88,6 +88,15 @@ def test_options_that_make_no_sense_are_named(tmp_path, capsys):
         assert message in refused(capsys, tmp_path, *options)
 
 
+def test_a_mask_that_keeps_the_artifact_is_refused(tmp_path, capsys, draw_effect, photos):
+    layers = draw_effect("dashboard", HEIGHT, WIDTH)
+    write(tmp_path / "photos", [layers.apply(photo) for photo in photos(12)])
+    Image.fromarray(layers.transmittance.min(axis=-1) <= 0.9).save(tmp_path / "mask.png")
+    line = refused(capsys, tmp_path, "--mask", str(tmp_path / "mask.png"), "--threads", "1")
+    assert "which is the static artifact" in line
+    assert "--invert-mask" in line
+
+
 def test_photos_that_show_nothing_in_common_stop_the_command(tmp_path, capsys):
     """The work is kept: with another --min-registered the next run needs no new features."""
     write(tmp_path / "photos", noise(4))

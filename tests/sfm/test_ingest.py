@@ -25,7 +25,7 @@ def brought_in(folder: Path, frames: int = 10) -> tuple[Path, list[str]]:
     dataset.mkdir()
     source = read_source(folder, "frame", min_photos=1)
     calls: list[int] = []
-    photos = ingest(source, dataset, frames, lambda: calls.append(1))
+    (photos,) = ingest(source, dataset, frames, lambda: calls.append(1))
     assert len(calls) == len(photos)
     assert len(photos) == expected_count(source, frames)
     return dataset, [photo.source for photo in photos]

@@ -57,7 +57,7 @@ def test_features_and_matches_are_made_once(tmp_path, photos):
         structure.extract(never)
         structure.match(never)
         assert seen[0] == (("features", VIEWS) if stops else ("features", 0))
-        structure.map(never)
+        structure.map(never, {})
         models.append(pycolmap.Reconstruction(tmp_path / folder / MODEL))
     whole, stopped = models
     assert whole.num_reg_images() == stopped.num_reg_images() == VIEWS

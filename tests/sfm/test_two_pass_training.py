@@ -12,11 +12,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 from PIL import Image
 from small_captures import HEIGHT, WIDTH, write
 
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.sfm.nerfstudio_dataset import MASK
+
+pytestmark = pytest.mark.slow
 
 BIN = Path(sys.executable).parent
 
