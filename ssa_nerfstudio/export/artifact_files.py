@@ -35,6 +35,8 @@ LAYERS_FILE = "layers.npz"
 def write_overlay(folder: Path, checkpoint: Checkpoint, layers: list[ArtifactLayers], threshold: float) -> dict:
     """Write overlay.json and the artifact of every camera, of several in folders camera_0, camera_1, ...
 
+    Where the artifact changes, each interval has a folder, camera_0_interval_1, ...
+
     Args:
         folder: exists and is empty.
         checkpoint: where the layers come from, for the description.
@@ -45,10 +47,17 @@ def write_overlay(folder: Path, checkpoint: Checkpoint, layers: list[ArtifactLay
         The contents of overlay.json.
     """
     cameras = []
-    for number, layer in enumerate(layers):
-        name = f"camera_{number}" if len(layers) > 1 else "."
+    for layer in layers:
+        name = layer.name if len(layers) > 1 else "."
         (folder / name).mkdir(exist_ok=True)
-        cameras.append({"folder": name, **_write_camera(folder / name, layer, threshold)})
+        cameras.append(
+            {
+                "folder": name,
+                "name": layer.name,
+                "photos_from": layer.start,
+                **_write_camera(folder / name, layer, threshold),
+            }
+        )
     description: dict[str, Any] = {
         "checkpoint": str(checkpoint.path),
         "step": checkpoint.step,

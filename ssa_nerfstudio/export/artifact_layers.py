@@ -10,6 +10,7 @@ import numpy as np
 import scipy.ndimage
 import torch
 
+from ssa_nerfstudio.cameras.intervals import BEGINNING
 from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted_lens
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.checkpoint import Checkpoint
@@ -30,12 +31,18 @@ class ArtifactLayers:
     addition: np.ndarray
     """B: float32 [H, W, 3], not negative."""
     camera: Lens
-    """Intrinsics of the frame that the layers are in."""
-    frame: Literal["undistorted", "raw"]
-    """undistorted: the frame that nerfstudio trains in; raw: that of the original photos."""
+    """Intrinsics of the frame that the layers are in; of an equirectangular one the scale in its middle."""
+    frame: Literal["undistorted", "raw", "equirectangular"]
+    """undistorted: the frame that nerfstudio trains in; raw: that of the original photos; equirectangular: that of the
+    360 degree photos whose faces were trained on."""
     kind: Literal["learned", "given"]
+    name: str = "camera_0"
+    """Of the camera, or of its interval (`Artifacts.name`)."""
+    start: str = BEGINNING
+    """The interval's first photo, relative to the dataset."""
     known: np.ndarray | None = None
-    """bool [H, W]: False outside the cropped undistorted frame, where nothing was learned; None: all is known."""
+    """bool [H, W]: False outside the cropped undistorted frame or the faces, where nothing was learned; None: all is
+    known."""
 
     def straight(self) -> tuple[np.ndarray, np.ndarray]:
         """Straight color W [H, W, 3] and matte A [H, W, 1], both in [0, 1]."""
@@ -69,7 +76,7 @@ class ArtifactLayers:
         known = self.known
         if known is not None:
             known = cv2.resize(known.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0
-        return ArtifactLayers(transmittance, addition, camera, self.frame, self.kind, known)
+        return ArtifactLayers(transmittance, addition, camera, self.frame, self.kind, self.name, self.start, known)
 
 
 def undistorted_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
@@ -87,7 +94,11 @@ def undistorted_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
         kind = "learned" if isinstance(overlay, ScreenSpaceOverlay) else "given"
         width, height, *intrinsics = key
         camera = Lens(int(width), int(height), *intrinsics)
-        result.append(ArtifactLayers(transmittance, addition, camera, "undistorted", kind))
+        result.append(
+            ArtifactLayers(
+                transmittance, addition, camera, "undistorted", kind, artifacts.name(group), artifacts.starts[group]
+            )
+        )
     return result
 
 
@@ -121,5 +132,7 @@ def raw_layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
         transmittance = distort(layers.transmittance, lens, 1.0)
         addition = distort(layers.addition, lens, 0.0)
         known = distort(np.ones((target.height, target.width), np.float32), lens, 0.0) > _MIN_KNOWN_WEIGHT
-        result.append(ArtifactLayers(transmittance, addition, lens, "raw", layers.kind, known))
+        result.append(
+            ArtifactLayers(transmittance, addition, lens, "raw", layers.kind, layers.name, layers.start, known)
+        )
     return result

@@ -67,7 +67,7 @@ def write_ply(
     """Write a binary PLY, byte for byte what `ns-export gaussian-splat` of nerfstudio 1.1.5 writes.
 
     Args:
-        path: file to write, replaced when it is complete.
+        path: file to write, replaced when it is complete; its folder is made where missing.
         gaussians: `Checkpoint.gaussians()`.
         kept: [N] bool.
         colors: spherical harmonics, or 8-bit red, green and blue of the constant term alone.
@@ -77,6 +77,7 @@ def write_ply(
     """
     if not kept.any():
         raise InputError(f"no Gaussian of {len(kept)} is finite and visible: there is nothing to write to {path}")
+    path.parent.mkdir(parents=True, exist_ok=True)
     blocks = properties(gaussians, kept, colors)
     row = np.dtype([(str(number), values.dtype, values.shape[1:]) for number, (_, values) in enumerate(blocks)])
     count = int(kept.sum())

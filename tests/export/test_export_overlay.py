@@ -158,19 +158,20 @@ def test_photos_lose_light_and_it_is_told_where_they_are_white_by_it(tmp_path, c
     shot = np.rint(255 * full.clip(0, 1)).astype(np.uint8)
     (tmp_path / "photos").mkdir()
     Image.fromarray(shot).save(tmp_path / "photos" / "a.png")
-    export(write_run(tmp_path / "run", one_camera(overlay)), tmp_path / "out", "--apply", tmp_path / "photos")
+    config = write_run(tmp_path / "run", one_camera(overlay))
+    export(config, tmp_path / "out", "--apply", tmp_path / "photos", "--threshold", 0.9)
     restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
-    lost = (addition > 0.95).any(axis=-1)
+    lost = (np.maximum(1 - transmittance, addition) > 0.9).any(axis=-1)
     white = (shot == 255).any(axis=-1) & ~lost
     assert white.any()
-    assert not restored[lost].any()
-    assert np.abs(restored - truth)[~lost & ~white].max() <= 1
-    assert (restored <= truth + 1)[white].all()
+    seen = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png")) > 0
+    assert not (seen & lost).any()
+    assert not restored[~seen].any()
+    assert np.abs(restored - truth)[seen & ~white].max() <= 1
+    assert (restored <= truth + 1)[seen & white].all()
     said = capsys.readouterr().out
-    assert f"{lost.mean():.1%} of their pixels" in said
-    assert f"{white.mean():.1%} of the pixels are white by it" in said
-    seen = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png"))
-    np.testing.assert_array_equal(seen == 0, lost)
+    assert f"{(~seen).mean():.1%} of their pixels" in said
+    assert f"{(white & seen).mean():.1%} of the pixels are white by it" in said
 
 
 def test_the_layers_can_be_given_to_another_training(tmp_path, tiny_scene, configure_training, train_and_evaluate):
@@ -267,7 +268,7 @@ def old_run(folder: Path) -> Path:
     path = next((folder / "nerfstudio_models").iterdir())
     saved = torch.load(path, weights_only=True)
     state, overlay = saved["pipeline"], "_model.artifacts.overlays.0."
-    del state["_model.artifacts.lenses"], state[f"{overlay}near"]
+    del state["_model.artifacts.lenses"]
     state[f"{overlay}frame"] = state[f"{overlay}frame"][:3]
     torch.save(saved, path)
     return config
@@ -281,6 +282,18 @@ def test_a_checkpoint_of_the_first_version_is_still_read(tmp_path, capsys):
         export(old_run(tmp_path / "run"), tmp_path / "raw", "--raw-frame")
     assert "use the undistorted frame" in capsys.readouterr().err
     assert not (tmp_path / "raw").exists()
+
+
+def test_a_checkpoint_with_pixels_that_waited_for_the_scene_is_still_read(tmp_path):
+    config = write_run(tmp_path / "run", one_camera(learned()))
+    export(config, tmp_path / "new")
+    (checkpoint,) = config.parent.glob("nerfstudio_models/*.ckpt")
+    loaded = torch.load(checkpoint, weights_only=False)
+    state = loaded["pipeline"]
+    state["_model.artifacts.overlays.0.near"] = torch.ones_like(state["_model.artifacts.overlays.0.evidence"])
+    torch.save(loaded, checkpoint)
+    export(config, tmp_path / "before")
+    assert (tmp_path / "before" / "overlay.png").read_bytes() == (tmp_path / "new" / "overlay.png").read_bytes()
 
 
 def test_photos_lose_a_watermark_and_keep_the_rest(tmp_path, capsys, draw_effect):
@@ -306,13 +319,14 @@ def test_what_an_opaque_artifact_hides_is_black_and_counted(tmp_path, capsys, dr
     config = write_run(tmp_path / "run", one_camera(given(layers)))
     export(config, tmp_path / "out", "--apply", tmp_path / "photos")
     restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
-    hidden = layers.transmittance.min(axis=-1) < 0.05
-    assert not restored[hidden].any()
-    clear = layers.transmittance.min(axis=-1) > 0.9
-    assert np.abs(restored - truth)[clear].max() <= 1
-    mask = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png"))
-    np.testing.assert_array_equal(mask == 0, hidden)
-    assert f"{hidden.mean():.1%} of their pixels" in capsys.readouterr().out
+    seen = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png")) > 0
+    hidden = (layers.transmittance < 0.5).any(axis=-1)
+    assert not (seen & hidden).any()
+    assert not restored[~seen].any()
+    assert np.abs(restored - truth)[seen].max() <= 2
+    beyond = cv2.dilate(hidden.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert seen[~beyond].all()
+    assert f"{(~seen).mean():.1%} of their pixels" in capsys.readouterr().out
 
 
 def test_original_photos_of_twice_the_size_are_restored(tmp_path, draw_effect):
@@ -341,10 +355,13 @@ def test_photos_of_a_rig_need_to_know_their_camera(tmp_path, capsys, draw_effect
     Image.fromarray(marks[1].apply(photo())).save(tmp_path / "photos" / "a.png")
     with pytest.raises(SystemExit):
         export(config, tmp_path / "out", "--apply", tmp_path / "photos")
-    assert "--camera 0 to 1" in capsys.readouterr().err
-    export(config, tmp_path / "out", "--apply", tmp_path / "photos", "--camera", 1)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "2 overlays: camera_0, camera_1" in said
+    assert "--camera 0 to 1" in said
+    export(config, tmp_path / "out", "--apply", tmp_path / "photos", "--camera", 1, "--threshold", 0.7)
     restored = np.asarray(Image.open(tmp_path / "out" / "photos" / "a.png")).astype(int)
-    seen = marks[1].transmittance.min(axis=-1) > 0.3
+    seen = np.asarray(Image.open(tmp_path / "out" / f"mask_white_is_scene_{WIDTH}x{HEIGHT}.png")) > 0
+    assert seen.mean() > 0.8
     assert np.abs(restored - photo())[seen].max() <= 3
 
 

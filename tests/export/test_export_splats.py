@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from mutations import OFTEN, one_line
 from nerfstudio.scripts.exporter import ExportGaussianSplat
 from plyfile import PlyData
 from small_checkpoints import random_gaussians, write_run
 
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.export.checkpoint import Checkpoint
 
 
 def export(config: Path, output: Path, *options: object) -> Path:
@@ -159,3 +164,36 @@ def test_contradicting_options_are_refused(tmp_path, capsys, options, complaint)
         export(config, tmp_path / "out", *options)
     assert complaint in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_the_newest_whole_checkpoint_is_exported_and_the_others_are_named(tmp_path, caplog):
+    config = write_run(tmp_path / "run", None, random_gaussians(4, seed=1), step=5)
+    write_run(tmp_path / "run", None, random_gaussians(4, seed=2), step=9)
+    newest = tmp_path / "run/nerfstudio_models/step-000000009.ckpt"
+    content = bytearray(newest.read_bytes())
+    content[content.index(random_gaussians(4, seed=2)["means"].numpy().tobytes())] ^= 1
+    newest.write_bytes(content)
+    found = Checkpoint.read(config)
+    assert found.step == 5
+    assert torch.equal(found.gaussians()["means"], random_gaussians(4, seed=1)["means"])
+    assert f"{newest} cannot be read as a checkpoint (the checksum of" in caplog.text
+    assert "--step chooses one" in caplog.text
+    with pytest.raises(InputError, match=r"checksum .* choose another with --step: there are 9, 5"):
+        Checkpoint.read(config, step=9)
+
+
+@OFTEN
+@given(place=st.integers(0, 10**9), value=st.integers(1, 255))
+def test_no_flipped_byte_is_exported_as_another_scene(tmp_path, place, value):
+    config = write_run(tmp_path / "run", None, random_gaussians(4))
+    path = tmp_path / "run/nerfstudio_models/step-000000009.ckpt"
+    content = bytearray(path.read_bytes())
+    content[place % len(content)] ^= value
+    path.write_bytes(content)
+    try:
+        found = Checkpoint.read(config)
+    except InputError as refused:
+        one_line(refused, "step-000000009.ckpt")
+        return
+    for name, values in random_gaussians(4).items():
+        assert torch.equal(found.gaussians()[name], values), name
