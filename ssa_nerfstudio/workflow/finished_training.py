@@ -1,0 +1,110 @@
+"""What a finished training shows: metrics of its test views, and one view a camera with and without the artifact."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.plugin.camera_matching import find_frame, group_cameras
+from ssa_nerfstudio.plugin.evaluation import view_metrics
+from ssa_nerfstudio.plugin.pipeline import SSAPipeline
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+
+WIDEST = 960
+"""Longest side of a stored picture, pixels."""
+_FILE = "evaluation.json"
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Metrics of the test views."""
+
+    metrics: dict[str, float]
+    """Means over the test views, by name."""
+    views: dict[str, dict[str, float]]
+    """Metrics by the photo's name."""
+    clean_test_views: bool
+    """See `Transforms.test_photos_are_clean`."""
+    overlays: list[int | None] = field(default_factory=list)
+    """Which of the run's overlays each camera has, in the order of `write_view_pictures`; None where it has none."""
+
+    @staticmethod
+    def read(folder: Path) -> Evaluation:
+        """Read what `write` wrote."""
+        return Evaluation(**json.loads((folder / _FILE).read_text(encoding="utf-8")))
+
+    def write(self, folder: Path) -> None:
+        """Write evaluation.json."""
+        (folder / _FILE).write_text(json.dumps(asdict(self), indent=1) + "\n", encoding="utf-8")
+
+
+@torch.no_grad()
+def evaluate(pipeline: SSAPipeline, data: Path, on_progress: ProgressCallback) -> Evaluation:
+    """Compare the clean render, and with an overlay the composite, with every test photo.
+
+    Args:
+        pipeline: a trained one, with its test views.
+        data: its dataset.
+        on_progress: called after every view.
+    """
+    names = [path.name for path in pipeline.datamanager.eval_dataset.image_filenames]
+    views = {}
+    for name, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
+        outputs = pipeline.model.get_outputs_for_camera(camera)
+        views[name] = view_metrics(outputs, pipeline.model.target(outputs, batch))
+        on_progress("test view", len(views), len(names))
+    keys = next(iter(views.values()))
+    means = {key: sum(view[key] for view in views.values()) / len(views) for key in keys}
+    return Evaluation(means, views, Transforms.read(data).test_photos_are_clean, _overlays(pipeline))
+
+
+def _overlays(pipeline: SSAPipeline) -> list[int | None]:
+    artifacts = pipeline.model.artifacts
+    if artifacts.changes:
+        return list(range(len(artifacts)))  # pictures are of intervals
+    _ = pipeline.datamanager.cached_train  # undistorts the photos and rewrites their cameras
+    keys, _ = group_cameras(pipeline.datamanager.train_dataset.cameras)
+    known = torch.cat([artifacts.camera_keys, artifacts.bare_keys]).cpu()
+    places = [find_frame(key, known) for key in keys] if len(artifacts) else [None] * len(keys)
+    return [place if place is not None and place < len(artifacts) else None for place in places]
+
+
+@torch.no_grad()
+def write_view_pictures(pipeline: SSAPipeline, folder: Path) -> None:
+    """Write the middle training photo of each camera, and the same view without the artifact.
+
+    Where the artifact changes, of each interval that has one.
+
+    Args:
+        pipeline: a trained one.
+        folder: exists; photo-1.jpg and clean-1.jpg are written, for a second camera photo-2.jpg, ...
+    """
+    photos = pipeline.datamanager.cached_train  # undistorts the photos and rewrites their cameras
+    cameras = pipeline.datamanager.train_dataset.cameras
+    _, groups = group_cameras(cameras)
+    artifacts = pipeline.model.artifacts
+    if artifacts.changes:
+        groups = [artifacts.group_of_view(view) for view in range(len(photos))]
+    for group in sorted({group for group in groups if group is not None}):
+        members = [view for view, at in enumerate(groups) if at == group]
+        middle = members[len(members) // 2]
+        camera = cameras[middle : middle + 1].to(pipeline.device)
+        clean = pipeline.model.get_outputs_for_camera(camera)["rgb"]
+        _save(photos[middle]["image"], folder / f"photo-{group + 1}.jpg")
+        _save(clean, folder / f"clean-{group + 1}.jpg")
+
+
+def _save(image: Tensor, path: Path) -> None:
+    """A JPEG of at most `WIDEST` pixels of an image [H, W, 3 or 4], uint8 or in [0, 1]."""
+    values = image[..., :3].cpu()
+    pixels = values.numpy() if values.dtype == torch.uint8 else np.rint(values.clamp(0, 1).numpy() * 255).astype("u1")
+    picture = Image.fromarray(pixels)
+    picture.thumbnail((WIDEST, WIDEST), Image.Resampling.LANCZOS)
+    picture.save(path, quality=90, subsampling=0)

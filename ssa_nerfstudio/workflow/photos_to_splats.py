@@ -1,0 +1,208 @@
+"""From photos to splats: the stages of `ssa run`, each of which leaves files that the next one reads.
+
+The stages run in one process, except for structure from motion, whose library does not share one with others.
+"""
+
+from __future__ import annotations
+
+import gc
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ssa_nerfstudio.data.panorama_entry import read_panorama
+from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
+from ssa_nerfstudio.evidence.capture_detection import Camera, detect_camera, detections_to_json, write_detections
+from ssa_nerfstudio.evidence.detection import Detection
+from ssa_nerfstudio.evidence.verdict_in_words import verdict_in_words
+from ssa_nerfstudio.export.artifact_layers import ArtifactLayers, undistorted_layers
+from ssa_nerfstudio.export.checkpoint import Checkpoint
+from ssa_nerfstudio.export.exposure_file import write_exposure
+from ssa_nerfstudio.export.panorama_artifact import face_changes, panorama_layers
+from ssa_nerfstudio.export.splats import select, write_compressed_ply, write_ply
+from ssa_nerfstudio.overlay.rgba import to_rgba8
+from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
+from ssa_nerfstudio.sfm.photos_to_dataset import Summary
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+from ssa_nerfstudio.workflow.finished_training import evaluate, write_view_pictures
+from ssa_nerfstudio.workflow.resumable_training import config_file, load_trained, train
+from ssa_nerfstudio.workflow.stages import Result, Stage
+
+DETECTION, DATASET, TRAINING, EVALUATION = "detection", "dataset", "training", "evaluation"
+"""Folders of a run, one for each of the first four stages."""
+RECORD = "run.json"
+"""File of the finished stages."""
+SPLATS, COMPRESSED = "splats.ply", "splats-compressed.ply"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A run: where it writes, and what the first stages do."""
+
+    output: Path
+    detect: Callable[[ProgressCallback], dict[str, Detection]]
+    """Tests the photos of each camera for an artifact."""
+    process: Callable[[ProgressCallback], Summary] | None
+    """Makes the dataset; None where the photos have poses already."""
+    data: Path
+    """The dataset, existing or to be made."""
+    training: SSATrainerConfig
+    """Of a training on that dataset, in the output folder."""
+    choices: dict[str, dict[str, Any]]
+    """What each of the first three stages was asked for, for the record."""
+    training_warnings: tuple[str, ...] = ()
+    """What the user should know about that training."""
+
+
+def stages(plan: Plan) -> list[Stage]:
+    """The stages up to the exported files; the report is written from what they leave.
+
+    Detection starts anew, and structure from motion knows by itself what it can keep; a training goes on as it began.
+    """
+    asked = plan.choices
+    made = []
+    if plan.process is not None:
+        made = [Stage("process", partial(_process, plan, plan.process), asked["process"])]
+    return [
+        Stage("detect", partial(_detect, plan), asked["detect"]),
+        *made,
+        Stage("train", partial(_train, plan), asked["train"], bound=True),
+        Stage("evaluate", partial(_evaluate, plan)),
+        Stage("export", partial(_export, plan)),
+    ]
+
+
+def detect_with_progress(
+    cameras: Sequence[Camera], threads: int, draws: int, on_progress: ProgressCallback
+) -> dict[str, Detection]:
+    """`evidence.capture_detection.detect_camera` of each camera, by its name."""
+    total, done = sum(camera.count for camera in cameras), count(1)
+
+    def counted(camera: Camera, threads: int) -> Iterator[np.ndarray]:
+        for photo in camera.photos(threads):
+            yield photo
+            on_progress("photo", min(next(done), total), total)
+
+    streams = [replace(camera, photos=partial(counted, camera)) for camera in cameras]
+    return {camera.name: detect_camera(camera, threads, draws=draws) for camera in streams}
+
+
+def artifact_files(overlays: int) -> list[tuple[str, str]]:
+    """Names of each camera's artifact and matte, given the number of overlays."""
+    numbers = [""] if overlays == 1 else [f"-{number}" for number in range(1, overlays + 1)]
+    return [(f"artifact{number}.png", f"matte{number}.png") for number in numbers]
+
+
+def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
+    found = plan.detect(on_progress)
+    with _emptied(plan.output / DETECTION) as staged:
+        write_detections(staged, found)
+        (staged / "detection.json").write_text(detections_to_json(found), encoding="utf-8")
+    sentences = [f"{name}: {verdict_in_words(detection)}" for name, detection in found.items()]
+    bare = [detection for detection in found.values() if detection.verdict == "none"]
+    missed = "a soft artifact has no edges; training looks again, with the scene's points, and says what it found"
+    return Result(
+        "; ".join(sentences) if len(found) > 1 else verdict_in_words(*found.values()), (missed,) if bare else ()
+    )
+
+
+def _process(plan: Plan, process: Callable[[ProgressCallback], Summary], on_progress: ProgressCallback) -> Result:
+    if plan.data.exists():  # complete: a run was killed before it recorded the stage
+        return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
+    summary = process(on_progress)
+    registered, photos = sum(each.count for each in summary.passes), sum(each.photos for each in summary.passes)
+    missing = [name for each in summary.passes for name in each.missing]
+    warning = f"no pose was found for {', '.join(missing[:5])}{', ...' * (len(missing) > 5)}; where parts of the "
+    warning += "scene are missing, add photos between them and their neighbors"
+    repaired = "" if summary.repair is None else f"; of the model, {summary.repair.in_words()}"
+    return Result(
+        f"{registered} of {photos} photos have poses, {summary.points:,} points, mean reprojection error "
+        f"{summary.reprojection_error:.2f} pixels{repaired}",
+        (warning,) if missing else (),
+    )
+
+
+def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
+    began = train(plan.training, on_progress)
+    _free_memory()
+    checkpoint = Checkpoint.read(config_file(plan.training))
+    layers = _layers(checkpoint)
+    overlays, kind = len(layers), "intervals" if any("interval" in layer.name for layer in layers) else "cameras"
+    decided = {0: "the scene alone was learned", 1: "the artifact was learned with the scene"}
+    text = decided.get(overlays, f"the artifacts of {overlays} {kind} were learned with the scene")
+    resumed = f" (continued at step {began:,})" if began else ""
+    return Result(f"{text}, in {checkpoint.step + 1:,} steps{resumed}", plan.training_warnings)
+
+
+def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:
+    pipeline = load_trained(plan.training)
+    evaluation = evaluate(pipeline, plan.data, on_progress)
+    with _emptied(plan.output / EVALUATION) as staged:
+        evaluation.write(staged)
+        write_view_pictures(pipeline, staged)
+    metrics = evaluation.metrics
+    del pipeline
+    _free_memory()
+    number = len(evaluation.views)
+    views = f"PSNR of {number} photo{'s' * (number > 1)} that the training did not see:"
+    if evaluation.clean_test_views or "composite_psnr" not in metrics:
+        return Result(f"{views} {metrics['psnr']:.1f} dB")
+    # The clean render differs from them by the artifact, however good it is.
+    return Result(f"{views} {metrics['composite_psnr']:.1f} dB, with the artifact that they have")
+
+
+def _export(plan: Plan, on_progress: ProgressCallback) -> Result:
+    checkpoint = Checkpoint.read(config_file(plan.training))
+    gaussians, layers = checkpoint.gaussians(), _pictured(_layers(checkpoint), plan.data)
+    kept = select(gaussians).kept
+    with unwritable_as_input_error(plan.output):
+        write_ply(plan.output / SPLATS, gaussians, kept)
+        on_progress("file", 1, 2 + 2 * len(layers))
+        write_compressed_ply(plan.output / COMPRESSED, gaussians, kept)
+        write_exposure(checkpoint, plan.output)
+        for number, (names, layer) in enumerate(zip(artifact_files(len(layers)), layers, strict=True)):
+            rgba = to_rgba8(torch.from_numpy(layer.transmittance), torch.from_numpy(layer.addition))
+            for name, pixels in zip(names, (rgba, rgba[..., 3]), strict=True):
+                with staged_file(plan.output / name) as part:
+                    Image.fromarray(pixels).save(part, format="PNG")
+            on_progress("file", 2 + 2 * (number + 1), 2 + 2 * len(layers))
+    return Result(f"{int(kept.sum()):,} Gaussians")
+
+
+def _layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
+    """The artifact of every camera; empty where the training had no overlay."""
+    return undistorted_layers(checkpoint) if checkpoint.has_overlay else []
+
+
+def _pictured(layers: list[ArtifactLayers], data: Path) -> list[ArtifactLayers]:
+    """What the artifact's pictures show: every camera's, or one on the sphere where the cameras are faces of it.
+
+    Where a face's artifact changes, every overlay of every face.
+    """
+    panorama = read_panorama(Transforms.read(data))
+    if panorama is None or not layers or face_changes(layers):
+        return layers
+    return [panorama_layers(layers, panorama)]
+
+
+def _emptied(folder: Path) -> AbstractContextManager[Path]:
+    """`staged_folder` without what a run left there that was killed before it recorded the stage."""
+    for left in [folder, *folder.parent.glob(f".{folder.name}.*")]:
+        shutil.rmtree(left, ignore_errors=True)
+    return staged_folder(folder)
+
+
+def _free_memory() -> None:
+    gc.collect()
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()

@@ -1,0 +1,78 @@
+"""A training without a viewer that continues from its newest checkpoint, and the pipeline that it leaves behind."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import torch
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+from nerfstudio.utils import writer
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.pipeline import SSAPipeline
+from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
+from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state, newest_first, step_of
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+
+
+def config_file(config: SSATrainerConfig) -> Path:
+    """The run's config.yml, which `ns-viewer`, `ns-eval` and the exports take."""
+    return config.get_base_dir() / "config.yml"
+
+
+def train(config: SSATrainerConfig, on_progress: ProgressCallback) -> int:
+    """Train up to the configuration's number of steps, from the newest checkpoint where there is one.
+
+    Args:
+        config: of a run whose folder has no time in its name, or a repeated call would start another one.
+        on_progress: called after every step.
+
+    Returns:
+        The step that it began at: 0, unless an earlier call left a checkpoint.
+
+    Raises:
+        SSAError: the input cannot be used, or the training cannot continue.
+    """
+    seed = config.machine.seed
+    random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
+    torch.manual_seed(seed)
+    config.load_dir = None
+    config.save_config()
+    checkpoints = Path(config.get_checkpoint_dir())
+    config.load_dir = checkpoints if newest_first(checkpoints) else None
+    try:
+        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+
+        def after_step(step: int) -> None:
+            on_progress("step", step + 1, config.max_num_iterations)
+
+        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after_step))
+        began = trainer._start_step
+        trainer.train()
+    finally:
+        # nerfstudio keeps its event writers in globals: the next run in this process starts with none.
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
+        writer.GLOBAL_BUFFER.clear()
+    return began
+
+
+def load_trained(config: SSATrainerConfig) -> SSAPipeline:
+    """The pipeline of a finished training with its test views, ready to render.
+
+    Raises:
+        InputError: its newest checkpoint cannot be read.
+    """
+    newest = newest_first(Path(config.get_checkpoint_dir()))[0]
+    state = load_pipeline_state(newest)
+    if state is None:
+        raise InputError(f"{newest} cannot be read as a checkpoint", "remove it and repeat the command")
+    pipeline = cast(SSAPipeline, config.pipeline.setup(device=config.machine.device_type, test_mode="test"))
+    pipeline.load_pipeline(state, step_of(newest))
+    pipeline.eval()
+    return pipeline

@@ -1,0 +1,114 @@
+"""report.html of a run: what was found and decided, the pictures, the figures, and the commands that repeat it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import timedelta
+from importlib.metadata import version
+from pathlib import Path
+
+from PIL import Image
+from rich.filesize import decimal
+
+from ssa_nerfstudio.export.exposure_file import FILE as EXPOSURE
+from ssa_nerfstudio.workflow.finished_training import Evaluation
+from ssa_nerfstudio.workflow.html_page import render_page
+from ssa_nerfstudio.workflow.photos_to_splats import COMPRESSED, EVALUATION, SPLATS, artifact_files
+from ssa_nerfstudio.workflow.stages import FinishedStage
+
+REPORT = "report.html"
+
+
+@dataclass(frozen=True)
+class CameraPictures:
+    """Of one camera."""
+
+    photo: Path
+    clean: Path
+    ratio: float
+    """Of width to height."""
+    artifact: Path | None
+    """None where it has no overlay."""
+    matte: Path | None
+
+
+def report_page(
+    output: Path, name: str, stages: Sequence[FinishedStage], commands: dict[str, str], on_sphere: bool = False
+) -> str:
+    """The page as HTML; it names files beside it and no absolute path.
+
+    Args:
+        output: folder of a run whose stages are all done.
+        name: of the capture.
+        stages: in order.
+        commands: title and text, to be called in the output folder.
+        on_sphere: whether the cameras are faces of 360 degree photos, with one artifact for all of them
+            unless it changes.
+    """
+    evaluation = Evaluation.read(output / EVALUATION)
+    whole = [output / name for name in artifact_files(1)[0]]
+    sphere = whole if on_sphere and whole[0].exists() else []
+    cameras = _cameras(output, evaluation, bool(sphere))
+    exposed = (output / EXPOSURE).exists()
+    files = [output / name for name in (SPLATS, COMPRESSED, *[EXPOSURE] * exposed)]
+    packages = ", ".join(f"{package} {version(package)}" for package in ("ssa-nerfstudio", "nerfstudio", "gsplat"))
+    return render_page(
+        Path(__file__).parent / "templates" / "run.html",
+        f"{name}: splats without the artifact"
+        if sphere or any(camera.artifact for camera in cameras)
+        else f"{name}: splats",
+        cameras=cameras,
+        sphere=sphere,
+        figures=_figures(evaluation, exposed),
+        carried=not evaluation.clean_test_views and "composite_psnr" in evaluation.metrics,
+        found={stage.name: stage.text for stage in stages},
+        decisions=[decision for stage in stages for decision in stage.decisions],
+        stages=[(stage.name, str(timedelta(seconds=round(stage.seconds))), stage.text) for stage in stages],
+        warnings=[warning for stage in stages for warning in stage.warnings],
+        files=[(file.name, decimal(file.stat().st_size)) for file in files],
+        commands=commands,
+        packages=packages,
+    )
+
+
+def _cameras(output: Path, evaluation: Evaluation, on_sphere: bool) -> list[CameraPictures]:
+    """The pictures of every camera, with those of its own artifact where it has one."""
+    folder = output / EVALUATION
+    count = len(list(folder.glob("photo-*.jpg")))
+    places = [None] * count if on_sphere else evaluation.overlays or list(range(count))
+    files = artifact_files(sum(place is not None for place in places))
+    overlays = [(None, None) if place is None else [output / name for name in files[place]] for place in places]
+    return [
+        CameraPictures(
+            folder / f"photo-{number}.jpg",
+            folder / f"clean-{number}.jpg",
+            _ratio(folder / f"photo-{number}.jpg"),
+            *(path if path is not None and path.exists() else None for path in overlays[number - 1]),
+        )
+        for number in range(1, count + 1)
+    ]
+
+
+def _ratio(picture: Path) -> float:
+    with Image.open(picture) as image:
+        return image.width / image.height
+
+
+def _figures(evaluation: Evaluation, exposed: bool) -> list[tuple[str, str, str]]:
+    """Name, value and meaning of what was measured on the test views; `exposed`: whether exposures were learned."""
+    metrics = evaluation.metrics
+    rows, corrected = [], []
+    if "composite_psnr" in metrics:
+        value = f"{metrics['composite_psnr']:.2f} dB"
+        rows.append(("PSNR with the artifact", value, "splats and artifact, as the photos are"))
+    if exposed and "cc_psnr" in metrics:
+        meaning = "splats alone, brought to the exposure of each photo, which is not known"
+        corrected.append(("Color-corrected PSNR", f"{metrics['cc_psnr']:.2f} dB", meaning))
+    return [
+        *rows,
+        ("PSNR", f"{metrics['psnr']:.2f} dB", "splats alone; higher is better"),
+        *corrected,
+        ("SSIM", f"{metrics['ssim']:.3f}", "splats alone; 1 is best"),
+        ("FLIP", f"{metrics['flip']:.3f}", "splats alone; 0 is best"),
+    ]

@@ -1,0 +1,223 @@
+"""Stages that run one after the other; those that an earlier run finished are not repeated."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+from ssa_nerfstudio.data.writing import write_text
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a stage says when it is done."""
+
+    text: str
+    """What came out, in one sentence without a period."""
+    warnings: tuple[str, ...] = ()
+    """What the user should know, each with its remedy."""
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step on the way. Its work may find its own output, complete or not, of a run that was killed."""
+
+    name: str
+    work: Callable[[ProgressCallback], Result]
+    choices: dict[str, Any] = field(default_factory=dict)
+    """What it depends on, JSON values by the name of the option."""
+    bound: bool = False
+    """Whether the choices are fixed as soon as it has begun, not only when it is done."""
+
+
+@dataclass(frozen=True)
+class FinishedStage:
+    """A stage of the record."""
+
+    name: str
+    seconds: float
+    """Of the attempt that finished it."""
+    text: str
+    warnings: tuple[str, ...] = ()
+    decisions: tuple[str, ...] = ()
+    """What it decided by itself while it worked, in sentences."""
+
+
+class StageDisplay(Protocol):
+    """What shows the progress."""
+
+    def begin(self, stage: str) -> None:
+        """A stage starts to work."""
+
+    def advance(self, stage: str, part: str, done: int, total: int) -> None:
+        """Part of a stage: how many items are done, and how many there are."""
+
+    def tell(self, decision: str) -> None:
+        """What a stage decided by itself, while it works."""
+
+    def finish(self, stage: FinishedStage, earlier: bool) -> None:
+        """A stage is done, in this run or an earlier one."""
+
+
+class RunRecord:
+    """`run.json`: the stages that have begun, what each was asked for, what it decided, and what came out."""
+
+    def __init__(self, path: Path) -> None:
+        """Read or start the record.
+
+        Args:
+            path: the file, in a folder that exists.
+
+        Raises:
+            InputError: the file is no record, the folder has other contents, or it cannot be written.
+        """
+        self._path = path
+        self.stages: dict[str, FinishedStage] = {}
+        self._choices: dict[str, dict[str, Any]] = {}
+        self._decisions: dict[str, list[str]] = {}
+        check_run_folder(path)
+        if not path.exists():
+            self._write()
+            return
+        try:
+            for name, entry in json.loads(path.read_text(encoding="utf-8")).items():
+                self._choices[name] = dict(entry["choices"])
+                decided = self._decisions[name] = list(entry.get("decisions", []))
+                if done := entry["done"]:
+                    known = {**done, "warnings": tuple(done["warnings"]), "decisions": tuple(decided)}
+                    self.stages[name] = FinishedStage(name, **known)
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+            raise InputError(f"{path} cannot be read ({error})", "choose another --output") from error
+
+    def check(self, stages: Sequence[Stage]) -> None:
+        """Check that stages are asked for what their part of the record was.
+
+        Raises:
+            InputError: one is not.
+        """
+        for stage in stages:
+            former = self._choices.get(stage.name)
+            if former is None or not (stage.bound or stage.name in self.stages):
+                continue
+            for name, choice in stage.choices.items():
+                if former.get(name) != choice:
+                    raise InputError(
+                        f"{self._path.parent} was begun with {name} {_words(former.get(name))}, not {_words(choice)}",
+                        "repeat what it was begun with to continue, or choose another --output",
+                    )
+
+    def begin(self, stage: Stage) -> None:
+        """Record what a stage is asked for."""
+        self._choices[stage.name] = stage.choices
+        self._write()
+
+    def decide(self, name: str, decision: str) -> None:
+        """Record at once what a stage decided: a training that is continued does not decide again."""
+        decided = self._decisions.setdefault(name, [])
+        if decision not in decided:
+            decided.append(decision)
+            self._write()
+
+    def finish(self, stage: FinishedStage) -> None:
+        """Record what came out of a stage."""
+        self.stages[stage.name] = replace(stage, decisions=tuple(self._decisions.get(stage.name, [])))
+        self._write()
+
+    def _write(self) -> None:
+        contents = {}
+        for name, choices in self._choices.items():
+            done = asdict(self.stages[name]) if name in self.stages else {}
+            contents[name] = {
+                "choices": choices,
+                "decisions": self._decisions.get(name, []),
+                "done": {key: done[key] for key in done if key not in ("name", "decisions")},
+            }
+        write_text(self._path, json.dumps(contents, indent=1) + "\n")
+
+
+def check_run_folder(record: Path) -> None:
+    """Check that a folder is a run's, new or empty.
+
+    Args:
+        record: its run.json.
+
+    Raises:
+        InputError: it has other contents.
+    """
+    folder = record.parent
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{folder} is a file", "choose another --output")
+    if folder.exists() and not record.exists() and any(not path.name.startswith(".") for path in folder.iterdir()):
+        raise InputError(f"{folder} exists and is no run", "choose another --output")
+
+
+def run_stages(stages: Sequence[Stage], record: RunRecord, display: StageDisplay) -> None:
+    """Run the stages that the record lacks, in order.
+
+    Raises:
+        SSAError: of a stage.
+        InputError: a stage was begun with other choices.
+    """
+    record.check(stages)
+    for stage in stages:
+        earlier = stage.name in record.stages
+        if not earlier:
+            display.begin(stage.name)
+            record.begin(stage)
+            start = time.perf_counter()
+
+            def told(decision: str, name: str = stage.name) -> None:
+                record.decide(name, decision)
+                display.tell(decision)
+
+            with _collected_warnings(told) as logged:
+                result = stage.work(partial(display.advance, stage.name))
+            warnings = (*result.warnings, *dict.fromkeys(entry.getMessage() for entry in logged))
+            record.finish(FinishedStage(stage.name, time.perf_counter() - start, result.text, warnings))
+        display.finish(record.stages[stage.name], earlier)
+
+
+@contextmanager
+def _collected_warnings(on_decision: Callable[[str], None]) -> Iterator[list[logging.LogRecord]]:
+    """Keep the library's warnings for the end of a stage; one that fails shows them at once.
+
+    Args:
+        on_decision: called with what the library logs at level INFO, which is what it decided (`plugin.decisions`).
+    """
+    logged: list[logging.LogRecord] = []
+
+    class Collector(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            if record.levelno < logging.WARNING:
+                on_decision(record.getMessage())
+            else:
+                logged.append(record)
+
+    logger = logging.getLogger("ssa_nerfstudio")
+    collectors: list[logging.Handler] = [Collector(logging.INFO)]
+    former, logger.handlers = logger.handlers, collectors
+    level = logger.level
+    logger.setLevel(logging.INFO)
+    try:
+        yield logged
+    except BaseException:
+        for handler in former:
+            for entry in logged:
+                handler.handle(entry)
+        raise
+    finally:
+        logger.handlers = former
+        logger.setLevel(level)
+
+
+def _words(choice: object) -> str:
+    return " ".join(map(str, choice)) if isinstance(choice, list) and choice else f"{choice or 'nothing'}"

@@ -1,0 +1,161 @@
+"""Stages that write files, interrupted and continued."""
+
+from __future__ import annotations
+
+import json
+import logging
+from contextlib import nullcontext
+from pathlib import Path
+
+import pytest
+
+from ssa_nerfstudio._system.terminal_messages import show_warnings
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.decisions import tell
+from ssa_nerfstudio.workflow.stages import FinishedStage, Result, RunRecord, Stage, run_stages
+
+
+class Shown:
+    """Keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.parts, self.told, self.finished = [], [], []
+
+    def begin(self, stage: str) -> None:
+        self.parts.append(stage)
+
+    def advance(self, stage: str, part: str, done: int, total: int) -> None:
+        self.parts.append((stage, part, done, total))
+
+    def tell(self, decision: str) -> None:
+        self.told.append(decision)
+
+    def finish(self, stage: FinishedStage, earlier: bool) -> None:
+        self.finished.append((stage.name, stage.text, stage.warnings, earlier))
+
+
+@pytest.fixture
+def counted(tmp_path):
+    """Three stages, the second of which fails as long as there is no file `repaired`; and how often each worked."""
+    worked = []
+
+    def work(name: str):
+        def do(on_progress) -> Result:
+            worked.append(name)
+            on_progress("half", 1, 2)
+            if name == "b" and not (tmp_path / "repaired").exists():
+                raise InputError("b is broken", "repair it")
+            return Result(f"{name} is done", ("look",) if name == "c" else ())
+
+        return do
+
+    return [Stage(name, work(name)) for name in "abc"], worked
+
+
+def test_what_is_done_is_not_repeated(tmp_path, counted):
+    stages, worked = counted
+    folder = tmp_path / "run"
+    folder.mkdir()
+    first, second = Shown(), Shown()
+    with pytest.raises(InputError, match="b is broken"):
+        run_stages(stages, RunRecord(folder / "run.json"), first)
+    (tmp_path / "repaired").touch()
+    run_stages(stages, RunRecord(folder / "run.json"), second)
+    assert worked == ["a", "b", "b", "c"]
+    assert first.finished == [("a", "a is done", (), False)]
+    assert second.finished == [
+        ("a", "a is done", (), True), ("b", "b is done", (), False), ("c", "c is done", ("look",), False),
+    ]  # fmt: skip
+    assert second.parts == ["b", ("b", "half", 1, 2), "c", ("c", "half", 1, 2)]
+
+
+def asked(folder: Path, fails: bool = False, bound: bool = False, **choices) -> None:
+    """Run one stage that was asked for something."""
+
+    def do(on_progress) -> Result:
+        if fails:
+            raise InputError("broken")
+        return Result("done")
+
+    folder.mkdir(exist_ok=True)
+    run_stages([Stage("a", do, choices, bound)], RunRecord(folder / "run.json"), Shown())
+
+
+def test_a_finished_stage_is_not_continued_with_other_choices(tmp_path):
+    asked(tmp_path / "run", steps=3, train=[])
+    with pytest.raises(InputError, match=r"begun with steps 3, not 4; repeat"):
+        asked(tmp_path / "run", steps=4, train=[])
+    with pytest.raises(InputError, match=r"begun with train nothing, not --vis viewer"):
+        asked(tmp_path / "run", steps=3, train=["--vis", "viewer"])
+    asked(tmp_path / "run", steps=3, train=[])
+
+
+@pytest.mark.parametrize("bound", [False, True])
+def test_a_stage_that_failed_takes_other_choices_unless_it_is_bound(tmp_path, bound):
+    with pytest.raises(InputError, match="broken"):
+        asked(tmp_path / "run", fails=True, bound=bound, share=0.5)
+    if bound:
+        with pytest.raises(InputError, match=r"begun with share 0.5, not 0.4"):
+            asked(tmp_path / "run", bound=True, share=0.4)
+        return
+    asked(tmp_path / "run", share=0.4)
+    with pytest.raises(InputError, match=r"begun with share 0.4, not 0.5"):
+        asked(tmp_path / "run", share=0.5)
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path):
+    (tmp_path / "holiday.jpg").touch()
+    with pytest.raises(InputError, match="exists and is no run"):
+        RunRecord(tmp_path / "run.json")
+    assert [path.name for path in tmp_path.iterdir()] == ["holiday.jpg"]
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", json.dumps({"a": {}}), json.dumps({"a": {"choices": {}, "done": {"seconds": 1}}})]
+)
+def test_a_broken_record(tmp_path, text):
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(InputError, match="cannot be read"):
+        RunRecord(tmp_path / "run.json")
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_what_the_library_warns_of_is_kept_with_the_stage(tmp_path, capsys, fails):
+    """A stage that fails has no place to keep it: then it is shown, as without stages."""
+
+    def do(on_progress) -> Result:
+        for _ in range(2):
+            logging.getLogger("ssa_nerfstudio.sfm").warning("two cameras are alike")
+        if fails:
+            raise InputError("broken")
+        return Result("done", ("look",))
+
+    show_warnings()
+    shown = Shown()
+    with nullcontext() if not fails else pytest.raises(InputError):
+        run_stages([Stage("a", do)], RunRecord(tmp_path / "run.json"), shown)
+    assert shown.finished == ([] if fails else [("a", "done", ("look", "two cameras are alike"), False)])
+    assert ("two cameras are alike" in capsys.readouterr().err) == fails
+
+
+def test_what_a_stage_decided_is_told_at_once_and_outlives_a_stop(tmp_path):
+    """As of a training that is killed, and then continued without deciding again."""
+    stopped = True
+
+    def do(on_progress) -> Result:
+        if stopped:
+            for _ in range(2):
+                tell("Exposure acts on the scene alone.")
+            assert json.loads(record.read_text())["train"]["decisions"] == ["Exposure acts on the scene alone."]
+            raise InputError("broken")
+        return Result("done")
+
+    record, shown = tmp_path / "run.json", Shown()
+    with pytest.raises(InputError, match="broken"):
+        run_stages([Stage("train", do)], RunRecord(record), shown)
+    assert shown.told == ["Exposure acts on the scene alone."] * 2
+    stopped = False
+    run_stages([Stage("train", do)], RunRecord(record), shown)
+    (done,) = RunRecord(record).stages.values()
+    assert done.decisions == ("Exposure acts on the scene alone.",)
+    assert done.warnings == ()
