@@ -64,7 +64,7 @@ def read(path: Path) -> dict[str, Any]:
     """
     try:
         values = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({error})", "give a YAML file") from error
     except yaml.YAMLError as error:
         raise InputError(f"{path} is no valid YAML ({error})", "correct that line") from error

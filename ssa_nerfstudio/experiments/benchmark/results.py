@@ -41,7 +41,8 @@ class Result:
     views: dict[str, dict[str, Number]] = field(default_factory=dict)
     """The same of each test view by its file's name."""
     artifact: dict[str, float] = field(default_factory=dict)
-    """The learned overlay against the true layers (`artifact_scores.score`), mean over cameras."""
+    """The learned overlay against the true layers (`metrics.matte.layer_errors`), mean over cameras; where a mask is
+    stated in their place, mean mattes inside and outside (`ArtifactRegion.mattes`)."""
     curve: list[dict[str, int | Number]] = field(default_factory=list)
     """Metrics along the run: step, seconds, gaussians, metrics."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -90,7 +91,7 @@ def read(path: Path) -> Result:
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_current_names)
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({error})") from error
     except ValueError as error:
         raise InputError(f"{path} is no whole JSON ({error}): truncated?") from error

@@ -12,7 +12,7 @@ import matplotlib.pyplot as plt
 from rich.table import Table
 
 from ssa_nerfstudio.experiments.demo.comparison import Comparison, Demonstration
-from ssa_nerfstudio.experiments.html_page import render_page
+from ssa_nerfstudio.workflow.html_page import render_page
 
 COLUMNS = (("psnr", "PSNR dB", "{:.2f}"), ("ssim", "SSIM", "{:.3f}"), ("flip", "FLIP", "{:.3f}"),
            ("mean_color_deviation", "mean color deviation", "{:.2f}"))  # fmt: skip
@@ -80,7 +80,7 @@ def _draw_sheet(demonstration: Demonstration, path: Path) -> None:
 
 def _page(demonstration: Demonstration, sheet: Path, results: dict) -> str:
     return render_page(
-        "demo.html",
+        Path(__file__).parents[1] / "templates/demo.html",
         "The same photos, without and with the overlay",
         sheet=sheet,
         headings=HEADINGS,

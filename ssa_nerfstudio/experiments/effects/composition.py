@@ -17,18 +17,20 @@ class Composition:
     view.
     """
 
-    def __init__(self, parts: Sequence[Layers | VaryingLayers]) -> None:
+    def __init__(self, parts: Sequence[Layers | VaryingLayers], coverage: np.ndarray | None = None) -> None:
         """Store the effects' layers, all of one frame size.
 
         Args:
             parts: at least one.
+            coverage: where they are seen, float32 [H, W] in [0, 1]; everywhere where None.
         """
         self.parts = list(parts)
+        self._coverage = coverage
         self._varying = [part for part in self.parts if isinstance(part, VaryingLayers)]
         self.box: Box | None = _bounding_box([part.box for part in self._varying]) if self._varying else None
         """Rectangle in which views differ; None where none does."""
         still = [part for part in self.parts if isinstance(part, Layers)]
-        self.static: Layers | None = reduce(Layers.behind, still) if still else None
+        self.static: Layers | None = self._seen(reduce(Layers.behind, still)) if still else None
         """The layers outside `box`; None where nothing covers it."""
 
     def view(self, generators: Sequence[np.random.Generator]) -> Layers:
@@ -50,8 +52,16 @@ class Composition:
                 for part in self.parts
             ),
         )
+        inside = self._seen(inside, self.box)
         pair = inside.transmittance, inside.addition
         return Layers(*(values.astype(np.float16).astype(np.float32) for values in pair))
+
+    def within(self, coverage: np.ndarray) -> Composition:
+        """The same, seen only where coverage float32 [H, W] in [0, 1] is 1."""
+        return Composition(self.parts, coverage)
+
+    def _seen(self, layers: Layers, box: Box = np.s_[:, :]) -> Layers:
+        return layers if self._coverage is None else layers.within(self._coverage[box])
 
     def apply(self, image: np.ndarray, inside: Layers | None) -> np.ndarray:
         """Put the artifact in front of an image.

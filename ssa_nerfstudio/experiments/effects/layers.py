@@ -78,6 +78,11 @@ class Layers:
         transmittance[box], addition[box] = inside.transmittance, inside.addition
         return Layers(transmittance, addition)
 
+    def within(self, coverage: np.ndarray) -> Layers:
+        """These layers where coverage float32 [H, W] in [0, 1] is 1, none where it is 0."""
+        share = coverage[..., None]
+        return Layers(1 - share * (1 - self.transmittance), share * self.addition)
+
     def apply(self, image: np.ndarray) -> np.ndarray:
         """Put the artifact in front of an image.
 

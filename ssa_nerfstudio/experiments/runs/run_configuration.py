@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import copy
+import difflib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import yaml
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
-from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
-
-METHODS: dict[str, SSATrainerConfig] = {
-    str(spec.config.method_name): cast(SSATrainerConfig, spec.config)
-    for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
-}
-"""The methods by name."""
 
 
 def configure(
@@ -28,17 +25,22 @@ def configure(
     model: dict[str, Any] | None = None,
     scale_factor: float = 1.0,
     seed: int = 0,
+    adapt: Callable[[SSATrainerConfig], None] = lambda config: None,
 ) -> SSATrainerConfig:
     """A method's configuration for an unattended run: no viewer, no evaluation in between, one checkpoint at the end.
 
     Args:
-        method: a key of `METHODS`.
+        method: a key of `plugin.methods.METHODS`.
         data: nerfstudio dataset; without named splits every 8th photo is held out.
         output: folder of the run (nerfstudio puts `<name>/<method>/<time>` below it).
         steps: number of training steps; schedules are scaled to it.
         model: values of the model's configuration by field name.
         scale_factor: photos are resized by this.
         seed: added to nerfstudio's own, of all random numbers and of the order of the views.
+        adapt: changes the method's configuration before `model` is applied.
+
+    Raises:
+        InputError: the model has no such setting.
     """
     config = copy.deepcopy(METHODS[method])
     config.vis = "tensorboard"
@@ -51,9 +53,11 @@ def configure(
     datamanager.data, datamanager.camera_res_scale_factor = data, scale_factor
     datamanager.train_cameras_sampling_seed += seed
     datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
+    adapt(config)
     for name, value in (model or {}).items():
         if not hasattr(config.pipeline.model, name):
-            raise AttributeError(f"the model has no setting {name!r}")
+            close = difflib.get_close_matches(name, vars(config.pipeline.model), n=1)
+            raise InputError(f"the model has no setting {name!r}", f"{close[0]!r} may be meant" if close else "")
         setattr(config.pipeline.model, name, value)
     return config
 

@@ -26,13 +26,13 @@ class TimedDatamanager(SSADatamanager):
 
 
 class TimedPipeline(SSAPipeline):
-    """A pipeline that tells what the overlay's statistics took, without decoding the photos."""
+    """A pipeline that tells what examining the photos took (the overlay's statistics), without decoding them."""
 
     statistics_seconds = 0.0
 
-    def _set_overlays(self) -> None:
+    def _examine_photos(self) -> None:
         start = time.perf_counter()
-        super()._set_overlays()
+        super()._examine_photos()
         # The photos may have been decoded meanwhile.
         self.statistics_seconds = time.perf_counter() - start - cast(TimedDatamanager, self.datamanager).photo_seconds
 

@@ -20,6 +20,7 @@ from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
 from ssa_nerfstudio.experiments.runs.machine import versions
 from ssa_nerfstudio.experiments.runs.run_timing import StepClock, TimedDatamanager, TimedPipeline, mean_metrics
+from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
 from ssa_nerfstudio.plugin.evaluation import view_metrics_without_flip
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
@@ -63,6 +64,7 @@ def train_and_evaluate(
     marks: tuple[int, ...] = (),
     test_scale: float | None = None,
     flip_processes: int = 1,
+    region: ArtifactRegion | None = None,
 ) -> tuple[Outcome, SSAPipeline, Path]:
     """Train a configuration to its end and evaluate every test view.
 
@@ -71,6 +73,7 @@ def train_and_evaluate(
         marks: steps after which the test views are evaluated too, with the clock stopped.
         test_scale: test photos are resized by this, training photos by the configuration's own.
         flip_processes: processes that compare views by FLIP.
+        region: where the photos' own artifact is; the test views' metrics are then taken inside and outside, too.
 
     Returns:
         The outcome, the trained pipeline, and the run's config.yml for `ns-eval`, `ns-export`, `ns-viewer`.
@@ -95,7 +98,7 @@ def train_and_evaluate(
         writer.EVENT_WRITERS.clear()  # not read by anything here
         pipeline = cast(TimedPipeline, trainer.pipeline)
         pipeline.read_photos(test_scale)
-        judge = partial(evaluate, pipeline, flips)
+        judge = partial(evaluate, pipeline, flips, region)
         clock = StepClock(pipeline, config.max_num_iterations, marks, on_step, judge)
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], clock.after_step))
         if clock.cuda:
@@ -132,8 +135,10 @@ def train_and_evaluate(
 
 
 @torch.no_grad()
-def evaluate(pipeline: SSAPipeline, flips: FlipProcesses) -> dict[str, dict[str, float]]:
-    """Metrics of each test view by its file's name.
+def evaluate(
+    pipeline: SSAPipeline, flips: FlipProcesses, region: ArtifactRegion | None = None
+) -> dict[str, dict[str, float]]:
+    """Metrics of each test view by its file's name, with a region also inside and outside of it.
 
     Raises:
         Diverged: as `train_and_evaluate`.
@@ -147,6 +152,8 @@ def evaluate(pipeline: SSAPipeline, flips: FlipProcesses) -> dict[str, dict[str,
         target = pipeline.model.target(outputs, batch)
         waiting[name] = flips.submit(outputs["rgb"], target)
         views[name] = view_metrics_without_flip(outputs, target)
+        if region is not None:
+            views[name] |= region.view_metrics(outputs, target)
     pipeline.train()
     return {name: {**views[name], "flip": flip.result()} for name, flip in waiting.items()}
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from PIL import Image
 
+from ssa_nerfstudio.data.sparse_points import write_points
 from ssa_nerfstudio.data.writing import staged_folder
 from ssa_nerfstudio.experiments.simulation.ray_casting import Cuboid, make_cuboid, trace
 
@@ -161,7 +162,7 @@ class DemoScene:
                     if artifact is not None and split == "train":
                         photo = artifact.apply(photo)
                     Image.fromarray(photo).save(dataset / name)
-            _write_ply(dataset / "sparse_pc.ply", *self.sparse_points())
+            write_points(dataset / "sparse_pc.ply", *self.sparse_points())
             (dataset / "transforms.json").write_text(json.dumps(self._transforms(names["train"], names["test"])))
 
     def _transforms(self, train: list[str], test: list[str]) -> dict[str, object]:
@@ -187,12 +188,3 @@ class DemoScene:
     def _cuboids(self) -> list[Cuboid]:
         rng = np.random.default_rng([self.seed, 0])
         return [make_cuboid(number, *geometry, rng=rng, inside=number == 0) for number, geometry in enumerate(_CUBOIDS)]
-
-
-def _write_ply(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
-    """Write an ASCII point cloud of positions [N, 3] and colors uint8 [N, 3]."""
-    properties = [f"property float {axis}" for axis in "xyz"]
-    properties += [f"property uchar {channel}" for channel in ("red", "green", "blue")]
-    header = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *properties, "end_header"]
-    rows = np.hstack([points, colors])
-    np.savetxt(path, rows, fmt="%.5f %.5f %.5f %d %d %d", header="\n".join(header), comments="")

@@ -63,6 +63,7 @@ def scene_record(dataset: Dataset, scene: Scene) -> str:
     record = {
         "effects": scene.describe(),
         "seed": scene.seed,
+        **({"exposure": scene.exposure} if scene.exposure else {}),
         "provenance": {
             "data": str(dataset.root),
             "downscale_factor": dataset.downscale_factor,

@@ -16,6 +16,9 @@ from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS, Effect, effect
 from ssa_nerfstudio.experiments.effects.composition import Composition
 from ssa_nerfstudio.experiments.effects.layers import VaryingLayers
 
+MAX_EXPOSURE = 1.0
+"""Largest deviation of the photos' exposure: a factor of 2.7 in displayed values."""
+
 
 @dataclass(frozen=True)
 class SceneFile:
@@ -25,12 +28,16 @@ class SceneFile:
     """From the scene outwards; each a name, a .yaml file, or keys and values: `effect` and that effect's parameters."""
     seed: int = 0
     """Decides everything random; not negative."""
+    exposure: float = 0.0
+    """Standard deviation of the logarithm of the photos' gains; 0: all photos have one exposure."""
     provenance: dict = field(default_factory=dict)
     """Written by `ssa simulate`; not read."""
 
     def __post_init__(self) -> None:
         if self.seed < 0:
             raise ValueError(f"SceneFile.seed must not be negative, got {self.seed}")
+        if not 0 <= self.exposure <= MAX_EXPOSURE:
+            raise ValueError(f"SceneFile.exposure must be in [0, {MAX_EXPOSURE}], got {self.exposure}")
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,8 @@ class Scene:
     """Name and parameters of each effect."""
     seed: int = 0
     """Not negative."""
+    exposure: float = 0.0
+    """See `SceneFile.exposure`."""
 
     def draw(self, height: int, width: int) -> Composition:
         """Draw the artifact at one frame size, pixels; there must be effects."""
@@ -109,7 +118,7 @@ def read_scene(name: str) -> Scene:
             effects += read_effects((item,), f"{path}: effects[{number}]")
         else:
             effects.append(_effect(item, f"{path}: effects[{number}]"))
-    return Scene(tuple(effects), stated.seed)
+    return Scene(tuple(effects), stated.seed, stated.exposure)
 
 
 def _effect(values: Any, where: str) -> tuple[str, Effect]:

@@ -20,12 +20,13 @@ from ssa_nerfstudio.experiments.simulation.scene import Scene
 def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None:
     """Write the dataset with the scene's artifact in front of every training photo.
 
-    Training photos become PNG: I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits. Everything else is copied
-    byte for byte; without effects that is every file but transforms.json, which gains the split alone.
+    Training photos become PNG: I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits, each under its exposure
+    where that varies. Everything else is copied byte for byte; without effects and exposure that is every file but
+    transforms.json, which gains the split alone.
 
     Args:
         dataset: the input.
-        scene: effects to put in front.
+        scene: effects to put in front, and how much exposure varies.
         output: folder to make; it appears when complete.
         threads: photos in flight at once, at least 1; memory is proportional to it and to the photos' size, not to
             their number.
@@ -33,7 +34,8 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
     Raises:
         InputError: the folder exists or cannot be written, or a file of the dataset is missing or cannot be used.
     """
-    corrupted = [view.path for view in dataset.views if view.role == "train"] if scene.effects else []
+    changed = bool(scene.effects or scene.exposure)
+    corrupted = [view.path for view in dataset.views if view.role == "train"] if changed else []
     renamed = {path: str(PurePosixPath(path).with_suffix(".png")) for path in corrupted}
     names = {view.path: view.path for view in dataset.views} | renamed
     _check_names(names)
@@ -50,7 +52,7 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
                 _copy(dataset.source(path, kind), folder / path)
         for path in dataset.points:
             _copy(dataset.root / path, folder / path)
-        if scene.effects:
+        if changed:
             for _ in corrupt(dataset, scene, names, folder, threads):
                 progress.advance(task)
         (folder / "scene.yaml").write_text(scene_record(dataset, scene), encoding="utf-8")

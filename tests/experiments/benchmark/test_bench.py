@@ -66,16 +66,15 @@ def test_a_run_takes_as_long_as_those_like_it():
     assert RuntimeEstimate([*known, slow]).seconds(elsewhere) == pytest.approx(78)
 
 
-def test_no_run_is_started_that_would_not_end_in_time(tmp_path):
+def test_no_run_is_started_that_would_not_end_in_time(tmp_path, capsys):
     runs = plan(read_benchmark("smoke"))
     slow = {"startup": 5.0, "statistics": 0.0, "training": 5000.0, "evaluation": 1.0}
     folder_of(tmp_path, [result(runs[0], seconds=slow)])
     (tmp_path / "scenes").mkdir()
     for run in runs:
         (tmp_path / "scenes" / run.dataset).mkdir(exist_ok=True)
-    done = ssa("bench", "smoke", "--output", tmp_path, "--time-limit", "10")
-    assert done.returncode == 0, done.stderr
-    assert "4 of 5 runs are left; call the same again to go on" in done.stdout
+    main(["bench", "smoke", "--output", str(tmp_path), "--time-limit", "10"])
+    assert "4 of 5 runs are left; call the same again to go on" in capsys.readouterr().out
     assert not (tmp_path / "logs").exists()
 
 
@@ -133,12 +132,11 @@ def test_one_training_answers_for_every_name_it_goes_by(tmp_path, capsys):
     assert not (known / "scenes").exists()
 
 
-def test_what_a_training_leaves_undone_is_left_under_each_of_its_names(tmp_path):
+def test_what_a_training_leaves_undone_is_left_under_each_of_its_names(tmp_path, capsys):
     path = tmp_path / "twice.yaml"
     path.write_text("scenes: [{data: demo}]\nparts: [{methods: [paper, l1-0.05], effects: [dashboard], steps: 5}]")
-    done = ssa("bench", path, "--output", tmp_path / "out", "--time-limit", "0.001")
-    assert done.returncode == 0, done.stderr
-    assert "2 of 2 runs are left" in done.stdout
+    main(["bench", str(path), "--output", str(tmp_path / "out"), "--time-limit", "0.001"])
+    assert "2 of 2 runs are left" in capsys.readouterr().out
 
 
 def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monkeypatch, capsys):
@@ -190,7 +188,7 @@ def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tm
     def ended(run, result):
         results.append((run.id, result.run.id, result.status))
 
-    runs = plan(benchmark())[:5]
+    runs = plan(benchmark())[:3]
     runner = DaskRunner(folder, ["4", "7"], 1, lambda run: "the command")
     assert runner.work(runs, lambda run: None, None, watch, ended) == []
     assert sorted(results) == sorted((run.id, run.id, "failed") for run in runs)
@@ -243,6 +241,7 @@ def test_processes_end_with_an_interrupted_benchmark(tmp_path):
     assert list(ResultsFolder(tmp_path).unfinished.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_imports_are_done_while_the_run_before_is_at_work(tmp_path, monkeypatch):
     """CUDA_VISIBLE_DEVICES is how `ssa bench` learns of a GPU; that there is none is nothing to it."""
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "0")
@@ -253,21 +252,39 @@ def test_imports_are_done_while_the_run_before_is_at_work(tmp_path, monkeypatch)
     assert second < 0.7 * first
 
 
-def test_a_run_that_fails_says_why(tmp_path, capsys):
+def test_a_misspelt_setting_is_refused_before_anything_runs(tmp_path, capsys):
     path = tmp_path / "misspelt.yaml"
     path.write_text(
-        "scenes: [{data: demo}]\ncandidates: {misspelt: {sparsness: log}}\n"
-        "parts: [{methods: [misspelt], effects: [none], steps: 5}]"
+        "scenes: [{data: demo}]\ncandidates: {misspelt: {sparsty: log}}\n"
+        "parts: [{methods: [3dgs, misspelt], effects: [none], steps: 5}]"
+    )
+    with pytest.raises(SystemExit) as refusal:
+        main(["bench", str(path), "--output", str(tmp_path / "out")])
+    assert refusal.value.code == 2
+    line = capsys.readouterr().err
+    assert "-misspelt-" in line
+    assert "the model has no setting 'sparsty'; 'sparsity' may be meant" in line
+    assert not (tmp_path / "out" / "scenes").exists()
+
+
+def test_a_run_that_fails_says_why_and_fails_the_command(tmp_path, capsys):
+    path = tmp_path / "negative.yaml"
+    path.write_text(
+        "scenes: [{data: demo}]\ncandidates: {negative: {sparsity_weight: -1.0}}\n"
+        "parts: [{methods: [negative], effects: [none], steps: 5}]"
     )
     (run,) = plan(read_benchmark(str(path)))
-    main(["bench", str(path), "--output", str(tmp_path / "out")])
-    said = capsys.readouterr().out
-    assert f"1 of 1 runs failed; call the same again to repeat them. First: {run.id}" in said
-    assert "are done" not in said
+    with pytest.raises(SystemExit) as failure:
+        main(["bench", str(path), "--output", str(tmp_path / "out")])
+    assert failure.value.code == 3
+    said = capsys.readouterr()
+    assert f"1 runs failed, first {run.id}: InputError: --pipeline.model.sparsity-weight must be at least 0" in said.err
+    assert "call the same again to repeat them" in said.err
+    assert "are done" not in said.out
     (failed,), _ = read_all([tmp_path / "out"])
     assert failed.status == "failed"
     assert failed.command == f"ssa bench {path} --output {tmp_path / 'out'} --only {run.id}"
-    assert "the model has no setting 'sparsness'" in failed.reason
+    assert "must be at least 0" in failed.reason
     assert RuntimeEstimate([failed]).seconds(run) is None
 
 
@@ -278,6 +295,8 @@ def test_a_run_that_fails_says_why(tmp_path, capsys):
         (["smoke", "--scenes", "garden"], "no scene 'garden'"),
         (["smoke", "--only", "*-snow-*"], "no run's id matches *-snow-*"),
         (["smoke", "--time-limit", "0"], "--time-limit"),
+        (["smoke", "--time-limit", "nan"], "--time-limit"),
+        (["smoke", "--time-limit", "inf"], "--time-limit"),
         (["smoke", "--runs-per-device", "0"], "--runs-per-device"),
         (["smoke", "--merge", "nowhere"], "holds no results"),
         (["captures", "--prepare-only"], "set SSA_DATA"),

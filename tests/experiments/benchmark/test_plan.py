@@ -11,7 +11,13 @@ import pytest
 from made_results import benchmark
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Part, SceneEntry, Tradeoff, read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import (
+    Benchmark,
+    Part,
+    SceneEntry,
+    Tradeoff,
+    read_benchmark,
+)
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run, marks, plan, plan_tradeoff
 from ssa_nerfstudio.experiments.configuration import build, shipped
 
@@ -51,6 +57,46 @@ def test_a_scene_with_an_artifact_of_its_own_gets_no_other_and_has_no_known_trut
     assert "given" not in {run.method for run in runs}
 
 
+def test_clean_counterparts_are_trained_on_where_nothing_is_asked_to_be_in_front():
+    yard = SceneEntry("yard", artifact="finger", clean="clean", mask="finger.png")
+    runs = plan(benchmark(scenes=(yard,)))
+    described = {(run.effect, run.real, run.counterparts, run.mask) for run in runs}
+    assert described == {("finger", True, "", "finger.png"), ("none", False, "clean", "finger.png")}
+    assert len({run.dataset for run in runs}) == 2
+    only = plan(benchmark(scenes=(yard,), parts=(Part(methods=("3dgs",), effects=("mud",)),)))
+    assert [run.effect for run in only] == ["finger"]
+
+
+def test_exposure_is_part_of_a_run_and_of_its_dataset():
+    plain, varying = (
+        plan(Benchmark((SceneEntry("barn", exposure=e),), (Part(("3dgs",), effect_seed=2),)))[0] for e in (0, 0.2)
+    )
+    assert plain.id != varying.id
+    assert plain.dataset != varying.dataset
+    assert (plain.effect_seed, varying.effect_seed) == (0, 2)  # it decides the draw of the exposures
+    with pytest.raises(ValueError, match="exposure"):
+        SceneEntry("barn", exposure=2.0)
+
+
+def test_a_run_that_uses_no_later_field_keeps_the_id_of_earlier_results():
+    runs = {run.id: run for run in plan(read_benchmark("captures"))}
+    earlier = runs["plush-dashboard-default-adc-7000-s0-7017f9b4"]
+    assert dataclasses.replace(earlier, mask="hood.png").id not in runs
+    assert dataclasses.replace(earlier, clean_tests=False).id not in runs
+
+
+def test_a_candidate_starts_from_the_row_it_names():
+    part = Part(methods=("robustnerf", "robust-08", "softer"), effects=("mud",))
+    candidates = {"robust-08": {"method": "robustnerf", "inlier_quantile": 0.8}, "softer": {"sparsity": "log"}}
+    runs = plan(benchmark(scenes=(SceneEntry("barn"),), parts=(part,), candidates=candidates))
+    adc = {"strategy": "adc"}
+    assert [(run.baseline, run.model) for run in runs] == [
+        ("robustnerf", adc),
+        ("robustnerf", {**adc, "inlier_quantile": 0.8}),
+        ("", {**adc, "overlay": "on", "sparsity": "log"}),
+    ]
+
+
 def test_whatever_changes_the_outcome_changes_the_id():
     run = plan(benchmark())[0]
     others = [
@@ -61,6 +107,7 @@ def test_whatever_changes_the_outcome_changes_the_id():
         {"effect_seed": 1},
         {"downscale": 2},
         {"nerfstudio_method": "ssa-splatfacto-paper"},
+        {"baseline": "robustnerf"},
     ]
     ids = {dataclasses.replace(run, **change).id for change in others}
     assert len({*ids, run.id}) == 1 + len(others)
@@ -138,7 +185,10 @@ def test_marks_rise_to_the_last_step(steps, count):
         ),
         ("scenes: [{data: a, downscale: 0}]", "downscale"),
         ("scenes: [{data: 'a b'}]", "letters, digits"),
+        ("scenes: [{data: a, clean: b}]", "a: clean, mask and clean_tests are for scenes that state their artifact"),
+        ("scenes: [{data: a, artifact: mud, clean_tests: false}]", "a mask of the artifact is needed"),
         ("scenes: [{data: a}]\ncandidates: {paper: {sparsity: log}}", "candidate 'paper'"),
+        ("scenes: [{data: a}]\ncandidates: {mine: {method: ours}}", "no method 'ours'"),
         (
             "scenes: [{data: a}]\ntradeoff: {scenes: [a], knobs: {steps: 5}}",
             "tradeoff.knobs.steps: .* valid array, got 5",

@@ -126,6 +126,7 @@ def test_the_report_shows_every_method_and_names_a_file_that_is_no_result(resume
         assert sheet.width > 1000
 
 
+@pytest.mark.slow
 def test_the_tradeoff_draws_every_point_with_its_command(tmp_path, killed):
     folder, _ = killed
     (tmp_path / "scenes").symlink_to(folder / "scenes")  # made by the benchmark

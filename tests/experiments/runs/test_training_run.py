@@ -2,18 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
-import numpy as np
 import pytest
-import torch
 
-from benchmarks.guard_cost import Training
-from ssa_nerfstudio.experiments.benchmark.execution.artifact_scores import score, true_layers
-from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
 from ssa_nerfstudio.experiments.runs.training_run import Diverged, train_and_evaluate
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 FULL = {"num_downscales": 0}
 
@@ -72,70 +64,3 @@ def test_a_training_whose_gaussians_are_not_finite_has_diverged(tiny_scene, tmp_
     config.optimizers["opacities"]["optimizer"].lr = float("inf")
     with pytest.raises(Diverged, match="not finite"):
         train_and_evaluate(config)
-
-
-def _overlay(layers: Layers) -> ScreenSpaceOverlay:
-    """An overlay that is the artifact, as far as one matte for all channels can be."""
-    height, width = layers.matte.shape
-    overlay = ScreenSpaceOverlay(height, width)
-    alpha = torch.from_numpy(1 - layers.transmittance[..., :1])
-    color = torch.from_numpy(layers.addition) / alpha.clamp_min(1e-3)
-    with torch.no_grad():
-        overlay.alpha_logits.copy_(alpha.logit(eps=1e-6))
-        overlay.color_logits.copy_(color.logit(eps=1e-6))
-    return overlay
-
-
-def test_the_true_artifact_scores_best_and_none_scores_what_it_hides():
-    matte = np.zeros((20, 30), np.float32)
-    matte[10:] = 0.8
-    layers = Layers.composited(matte, np.array([0.5, 0.25, 1.0]))
-    right = score(_overlay(layers), layers.transmittance, layers.addition)
-    assert right["matte_iou"] == 1
-    assert max(right["matte_error"], right["premultiplied_error"], right["transmittance_error"]) < 1e-4
-    nothing = Layers.composited(np.zeros((20, 30)), np.zeros(3))
-    empty = score(_overlay(nothing), layers.transmittance, layers.addition)
-    assert empty["matte_iou"] == 0
-    assert empty["matte_error"] == pytest.approx(0.4, abs=1e-4)
-    assert empty["premultiplied_error"] == pytest.approx(0.4 * 1.75 / 3, abs=1e-4)
-
-
-def test_the_matte_of_added_light_is_the_least_opacity_that_explains_it():
-    added = np.zeros((20, 30, 3), np.float32)
-    added[:, :15, 1] = 0.6
-    overlay = ScreenSpaceOverlay(20, 30)
-    with torch.no_grad():
-        overlay.alpha_logits.fill_(-20.0)
-        overlay.alpha_logits[:, :15] = torch.tensor(0.6).logit()
-        overlay.color_logits.fill_(-20.0)
-        overlay.color_logits[:, :15, 1] = 20.0
-    scores = score(overlay, np.ones_like(added), added)
-    assert scores["matte_error"] == pytest.approx(0, abs=1e-5)
-    assert scores["premultiplied_error"] == pytest.approx(0, abs=1e-5)
-    assert scores["transmittance_error"] == pytest.approx(0.3, abs=1e-5)
-
-
-def test_a_truth_of_another_size_is_averaged(tmp_path: Path):
-    layers = Layers.composited(np.full((40, 60), 0.5), np.array([0.2, 0.4, 0.6]))
-    np.savez(tmp_path / "layers.npz", T=layers.transmittance, B=layers.addition)
-    small = Layers(layers.transmittance[::2, ::2].copy(), layers.addition[::2, ::2].copy())
-    scores = score(_overlay(small), *true_layers(tmp_path / "layers.npz", 0, 1))
-    assert scores["matte_error"] < 1e-5
-
-
-def test_what_is_far_from_static_edges_waits_for_the_scene_and_is_learned_then(tiny_scene, tmp_path):
-    config = configure("ssa-splatfacto", tiny_scene, tmp_path, 8, {**FULL, "overlay": "on", "scene_head_start": 4})
-    config.scale_schedules = False
-    config.set_timestamp()
-    trainer = config.setup(local_rank=0, world_size=1)
-    trainer.setup()
-    (overlay,) = trainer.pipeline.model.artifacts.learned()
-    overlay.near[:, 20:] = 0
-    start = overlay.alpha_logits.detach().clone()
-    trainer.pipeline.train()
-    training = Training(trainer)
-    for step in range(8):
-        training.step()
-        moved = overlay.alpha_logits != start
-        assert moved[:, :20].any()
-        assert moved[:, 20:].any() == (step >= 4)

@@ -49,7 +49,7 @@ def truncate(path: Path) -> None:
         (lambda data: edit(data, frames=frames(data)[:1]), "leaves no photo to train on"),
         (lambda data: edit(data, frames=[*frames(data), frames(data)[0]]), "has two frames of images/frame_009.jpg"),
         (lambda data: edit(data, fl_x=None), "camera of images/frame_009.jpg: fl_x is missing"),
-        (lambda data: edit(data, w="wide"), "could not convert string to float"),
+        (lambda data: edit(data, w="wide"), "w is no number: 'wide'"),
         (lambda data: edit(data, h=0), "frame must be at least 1 x 1 pixels"),
         (lambda data: edit(data, cx=float("nan")), "intrinsics must be finite"),
         (lambda data: edit(data, k1=float("inf")), "intrinsics must be finite"),

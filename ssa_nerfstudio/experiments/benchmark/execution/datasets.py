@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from string import Template
 
@@ -13,6 +13,7 @@ import numpy as np
 from PIL import Image
 
 from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.data.transforms import SPLITS
 from ssa_nerfstudio.data.writing import staged_file, staged_folder
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import DEMO
@@ -57,11 +58,18 @@ def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> Non
         InputError: a capture is missing or cannot be used.
     """
     for run in {run.dataset: run for run in runs}.values():
+        if run.mask and not (mask := mask_path(run, artifacts)).exists():
+            _keep_mask(source(run.data) / run.mask, mask)
         if not (folder / run.dataset).exists():
             dataset = _clean(run, folder, threads)
             effects = () if run.real or run.effect == CLEAN else read_effects((run.effect,))
-            scene = KeptScene(effects, run.effect_seed, run.effect, artifacts)
+            scene = KeptScene(effects, run.effect_seed, run.exposure, run.effect, artifacts)
             simulate(dataset, scene, folder / run.dataset, threads)
+
+
+def mask_path(run: Run, artifacts: Path) -> Path:
+    """Where the mask of a scene's own artifact is kept, beside the drawn effects."""
+    return artifacts / f"{run.scene}-mask{PurePosixPath(run.mask).suffix}"
 
 
 @dataclass(frozen=True)
@@ -99,14 +107,41 @@ def _clean(run: Run, folder: Path, threads: int) -> Dataset:
             DemoScene(**DEMO_SIZE).write(clean, None)
         return Dataset.read(clean, run.eval_interval)
     data = source(run.data)
+    dataset = Dataset.read(data, run.eval_interval)
+    if run.counterparts:
+        dataset = _with_photos_of(dataset, run.counterparts)
     if run.downscale == 1:
-        return Dataset.read(data, run.eval_interval)
-    if not (data / f"images_{run.downscale}").is_dir():
-        reduced = folder / f"{run.scene}-source-div{run.downscale}"
+        return dataset
+    if run.counterparts or not (data / f"images_{run.downscale}").is_dir():
+        of = f"-{run.counterparts.replace('/', '-')}" if run.counterparts else ""
+        reduced = folder / f"{run.scene}{of}-source-div{run.downscale}"
         if not reduced.exists():
-            _reduce(Dataset.read(data, run.eval_interval), run.downscale, reduced)
+            _reduce(dataset, run.downscale, reduced)
         data = reduced
     return Dataset.read(data, run.eval_interval, run.downscale)
+
+
+def _with_photos_of(dataset: Dataset, folder: str) -> Dataset:
+    """The dataset with the photos of the same names in another folder."""
+
+    def moved(path: str) -> str:
+        return str(PurePosixPath(folder, PurePosixPath(path).name))
+
+    splits = {f"{name}_filenames" for name in SPLITS} & dataset.meta.keys()
+    meta = {
+        **dataset.meta,
+        "frames": [{**frame, "file_path": moved(frame["file_path"])} for frame in dataset.meta["frames"]],
+        **{split: [moved(path) for path in dataset.meta[split]] for split in splits},
+    }
+    return replace(dataset, transforms=replace(dataset.transforms, meta=meta))
+
+
+def _keep_mask(mask: Path, kept: Path) -> None:
+    if not mask.is_file():
+        raise InputError(f"{mask} does not exist", "put the mask of the artifact there, or state no mask")
+    kept.parent.mkdir(parents=True, exist_ok=True)
+    with staged_file(kept) as part:
+        part.write_bytes(mask.read_bytes())
 
 
 def _reduce(dataset: Dataset, factor: int, output: Path) -> None:

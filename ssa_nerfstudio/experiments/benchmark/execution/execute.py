@@ -16,6 +16,7 @@ from ssa_nerfstudio.experiments.benchmark.execution.dask_runner import DaskRunne
 from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
 from ssa_nerfstudio.experiments.benchmark.execution.progress_table import ProgressTable
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
+from ssa_nerfstudio.experiments.benchmark.execution.run_process import configuration
 from ssa_nerfstudio.experiments.benchmark.results import Result, adopt, read_all
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.experiments.runs.machine import devices
@@ -68,6 +69,9 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
 
     Returns:
         The runs that were not done for lack of time.
+
+    Raises:
+        InputError: a run has a setting that its model has not, or its dataset cannot be made.
     """
     began = time.monotonic()
     deadline = None if options.time_limit is None else began + 60 * options.time_limit
@@ -81,6 +85,8 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
     for run in missing:
         names.setdefault(run.training, []).append(run)
     todo = [same[0] for training, same in names.items() if training not in known]
+    for run in todo:
+        _check_settings(run, place)
     prepare(todo, place.scenes, place.artifacts, options.threads)
 
     def command(run: Run) -> str:
@@ -105,6 +111,14 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
         runner = DaskRunner(place, found, options.runs_per_device, command, options.keep_models, options.scheduler)
         left = runner.work(todo, estimate.seconds, deadline, table.watch, ended)
     return [same for run in left for same in names[run.training]]
+
+
+def _check_settings(run: Run, place: ResultsFolder) -> None:
+    """Build a run's configuration now, so that a misspelt setting is not found after hours of other runs."""
+    try:
+        configuration(run, place)
+    except InputError as error:
+        raise InputError(f"{run.id}: {error.problem}", error.remedy) from error
 
 
 class RuntimeEstimate:

@@ -18,14 +18,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.execution.datasets import mask_path
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.results import Result, write
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.experiments.configuration import build
 
 if TYPE_CHECKING:
+    from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
     from ssa_nerfstudio.plugin.pipeline import SSAPipeline
     from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
 
@@ -94,17 +97,24 @@ def work(request: Request, revision: str) -> Result:
     note.stage("loading")
     result = Result(run, "failed", command=request.command, revision=revision)
     try:
+        from ssa_nerfstudio.experiments.benchmark.baselines.baseline import find
         from ssa_nerfstudio.experiments.runs import training_run as training
         from ssa_nerfstudio.experiments.runs.machine import versions
 
         result.versions = versions()
-        config = _configuration(run, place)
+        config = configuration(run, place)
         result.schedules = _schedules(config)
         note.stage("photos")
+        find(run.baseline).make_dataset(run, place.scenes / run.dataset, mask_path(run, place.artifacts))
         waited = 0.0 if request.asked is None else time.time() - request.asked
         try:
             outcome, pipeline, _ = training.train_and_evaluate(
-                config, note.step, run.marks, test_scale=1.0, flip_processes=request.flip_processes
+                config,
+                note.step,
+                run.marks,
+                test_scale=1.0,
+                flip_processes=request.flip_processes,
+                region=(region := _region(run, place)),
             )
         except training.Diverged as error:
             result.status, result.reason = "diverged", str(error)
@@ -115,7 +125,7 @@ def work(request: Request, revision: str) -> Result:
             result.seconds = {**outcome.seconds, "startup": waited + outcome.seconds["startup"]}
             result.gaussians, result.peak_memory_mb = outcome.gaussians, outcome.peak_memory_mb
             note.stage("pictures")
-            result.artifact = _artifact(run, pipeline, place)
+            result.artifact = _artifact(run, pipeline, place, region)
             from ssa_nerfstudio.experiments.runs.view_pictures import write_view_pictures
 
             write_view_pictures(pipeline, place.pictures(run.id))
@@ -131,11 +141,13 @@ def work(request: Request, revision: str) -> Result:
     return result
 
 
-def _configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:
+def configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:
     """nerfstudio's configuration of a run."""
+    from ssa_nerfstudio.experiments.benchmark.baselines.baseline import find
     from ssa_nerfstudio.experiments.runs import run_configuration
 
-    data = place.scenes / run.dataset
+    baseline = find(run.baseline)
+    data = baseline.trained_on(run, place.scenes / run.dataset)
     model: dict[str, Any] = {}
     if run.shipped_overlay:
         shipped = run_configuration.METHODS["ssa-splatfacto"].pipeline.model
@@ -151,6 +163,7 @@ def _configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:
         model,
         run.image_scale,
         run.seed,
+        baseline.adapt,
     )
     config.pipeline.datamanager.dataparser.downscale_factor = 1  # pyright: ignore[reportAttributeAccessIssue]
     return config
@@ -161,7 +174,7 @@ def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
     from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH, MODEL_STEPS, scaled
 
     final = scaled(config) if config.scale_schedules else config
-    names = (*MODEL_STEPS, "refine_every", "reset_alpha_every")
+    names = (*MODEL_STEPS, *final.pipeline.model.own_steps, "refine_every", "reset_alpha_every")
     values = {name: getattr(final.pipeline.model, name) for name in names}
     for name, entry in final.optimizers.items():
         if entry["scheduler"] is not None:
@@ -170,15 +183,34 @@ def _schedules(config: SSATrainerConfig) -> dict[str, Any]:
     return {"factor": config.max_num_iterations / FULL_LENGTH, **values}
 
 
-def _artifact(run: Run, pipeline: SSAPipeline, place: ResultsFolder) -> dict[str, float]:
+def _region(run: Run, place: ResultsFolder) -> ArtifactRegion | None:
+    """Where the photos' own artifact is, in the undistorted frame of the first camera; None where no mask is stated."""
+    if not run.mask:
+        return None
+    from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
+
+    lens = Dataset.read(place.scenes / run.dataset, run.eval_interval).views[0].lens
+    return ArtifactRegion.read(mask_path(run, place.artifacts), lens)
+
+
+def _artifact(run: Run, pipeline: SSAPipeline, place: ResultsFolder, region: ArtifactRegion | None) -> dict[str, float]:
     """Scores of the learned overlays, mean over cameras; empty where none was learned or no truth is known."""
     truth = place.scenes / run.dataset / "layers" / "undistorted.npz"
     learned = pipeline.model.artifacts.learned()
+    if region is not None and run.model.get("overlay") != "off":
+        # What detection took for clean photos has no overlay, that is a matte of 0.
+        return region.mattes(learned[0].matte().detach()[..., 0] if learned else None)
     if not learned or not truth.exists():
         return {}
-    from ssa_nerfstudio.experiments.benchmark.execution.artifact_scores import score, true_layers
+    import numpy as np
 
-    scores = [score(overlay, *true_layers(truth, g, len(learned))) for g, overlay in enumerate(learned)]
+    from ssa_nerfstudio.metrics.matte import layer_errors
+
+    suffixes = range(len(learned)) if len(learned) > 1 else ("",)
+    with np.load(truth) as true:
+        truths = [(true[f"T{suffix}"], true[f"B{suffix}"]) for suffix in suffixes]
+    layers = ([layer.detach().cpu().numpy() for layer in overlay.layers()] for overlay in learned)
+    scores = [layer_errors(found[0], found[1], *exact) for found, exact in zip(layers, truths, strict=True)]
     return {name: sum(values[name] for values in scores) / len(scores) for name in scores[0]}
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report import category_tables, detail_tables, difference_tables
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
+from ssa_nerfstudio.experiments.benchmark.report.latex import write_latex
 from ssa_nerfstudio.experiments.benchmark.report.picture_sheets import sheet
 from ssa_nerfstudio.experiments.benchmark.report.study import Study, studies
 from ssa_nerfstudio.experiments.benchmark.results import Result, absence, read_all
@@ -30,7 +31,7 @@ def store_plan(folder: Path, command: str, benchmark: Benchmark, runs: list[Run]
 
 
 def report(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
-    """Writes report.md and report.html, with sheets beside them.
+    """Writes report.md and report.html, with sheets beside them, and the tables as report.tex.
 
     Args:
         folders: of `ssa bench`; of a run that several hold, one is taken.
@@ -55,7 +56,8 @@ def report(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
         pictures = _sheets(study, folders, output)
         if pictures:
             sections.append(Section(f"Pictures, {study.title}", contents=list(pictures)))
-    return Document("What the overlay restores", sections).write(output, "report"), problems
+    document = Document("What the overlay restores", sections)
+    return [*document.write(output, "report"), write_latex(document, output / "report.tex")], problems
 
 
 def _plans(folders: list[Path]) -> tuple[set[str], set[str]]:
@@ -102,15 +104,19 @@ def _overview(results: list[Result], planned: set[str], problems: list[str], fol
 
 
 def _section(study: Study, with_paper: bool) -> Section:
+    if not study.clean_tests:
+        drawn = [detail_tables.by_mask(study), detail_tables.cost(study)]
+        return Section(study.title, [], [table for table in drawn if table is not None])
     drawn = [
         category_tables.results_by_category(study, with_paper),
         detail_tables.results_by_scene(study),
         category_tables.sensitivity(study, with_paper),
         category_tables.ablation(study, with_paper),
-        difference_tables.acceptance(study),
         difference_tables.paired(study, "default"),
         difference_tables.paired(study, "overlay-on") if "default" not in study.methods else None,
         detail_tables.artifact_itself(study),
+        detail_tables.by_mask(study),
+        detail_tables.by_exposure(study),
         detail_tables.cost(study),
     ]
     seeds = sorted({result.run.seed for result in study.results})

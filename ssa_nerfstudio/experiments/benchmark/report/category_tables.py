@@ -18,7 +18,7 @@ from ssa_nerfstudio.experiments.benchmark.report.table_cells import (
     format_value,
     row_name,
 )
-from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, title
+from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, title
 
 SENSITIVITY = ("l1-0", "l1-0.01", "l1-0.05")
 ABLATION = {
@@ -31,9 +31,12 @@ Published = dict[tuple[str, str, str], paper.Triple]
 
 def results_by_category(study: Study, with_paper: bool) -> Table:
     """Table `results`: mean over the scenes of a category, cells ADC / MCMC."""
-    methods = [name for name in study.methods if name not in SENSITIVITY and name != "constant-start"]
-    published = paper.REAL if study.real else paper.RESULTS
-    return _by_category(study, methods, "Results by category", published if with_paper else {})
+    published = (paper.REAL if study.real else paper.RESULTS) if with_paper else {}
+    beside = {method for _, method, _ in published} - {*study.methods}
+    rows = [name for name in METHODS if name in beside or name in study.methods]
+    rows += [name for name in study.methods if name not in METHODS]
+    methods = [name for name in rows if name not in SENSITIVITY and name != "constant-start"]
+    return _by_category(study, methods, "Results by category", published)
 
 
 def sensitivity(study: Study, with_paper: bool) -> Table | None:
@@ -62,8 +65,9 @@ def ablation(study: Study, with_paper: bool) -> Table | None:
         deviation = f"{paper.COLOR_DEVIATION[method]:.2f}" if known else ""
         for (of, densification), triple in published.items():
             if of == method:
-                figures = [FORMATS[m].format(v) for m, v in zip(METRICS, triple, strict=True)]
-                rows.append([f"  the paper, {densification.upper()}", *figures, deviation])
+                figures = {m: FORMATS[m].format(v) for m, v in zip(paper.METRICS, triple, strict=True)}
+                shown = [figures.get(metric, "") for metric in METRICS]
+                rows.append([f"  the paper, {densification.upper()}", *shown, deviation])
     headings = ["Configuration", *(HEADINGS[metric] for metric in metrics)]
     return Table("Ablation", headings, rows, f"Mean over all artifacts; cells are {densification_names(study)}.")
 
@@ -93,8 +97,9 @@ def _best(values: list[Value | None], metric: str) -> str | None:
 def _published(published: Published, kind: str, methods: list[str], densifications: list[str]) -> list[str]:
     cells = []
     for method in methods:
-        for number, metric in enumerate(METRICS):
-            triples = [published.get((kind, method, d)) for d in densifications]
-            texts = [FORMATS[metric].format(triple[number]) if triple else "-" for triple in triples]
-            cells.append(" / ".join(texts) if any(triples) else "")
+        pairs = (zip(paper.METRICS, published.get((kind, method, d), ()), strict=False) for d in densifications)
+        figures = [dict(pair) for pair in pairs]
+        for metric in METRICS:
+            texts = [FORMATS[metric].format(figure[metric]) if metric in figure else "-" for figure in figures]
+            cells.append("" if set(texts) == {"-"} else " / ".join(texts))
     return cells

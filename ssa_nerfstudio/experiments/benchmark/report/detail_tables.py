@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+from itertools import product
 
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import spread
 from ssa_nerfstudio.experiments.benchmark.report.document import Table
@@ -11,6 +12,8 @@ from ssa_nerfstudio.experiments.benchmark.report.table_cells import NOTE, densif
 from ssa_nerfstudio.experiments.benchmark.results import STAGES, Result
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import category, title
 
+PSNR_OVER_VIEWS = {"psnr": "mean", "psnr median": "median", "psnr worst": "worst view"}
+MATTES = {"matte_inside": "matte inside", "matte_outside": "outside", "matte_upper_third": "upper third"}
 ARTIFACT_SCORES = {
     "matte_error": "matte error ↓",
     "matte_iou": "IoU at 0.5 ↑",
@@ -22,21 +25,69 @@ ARTIFACT_SCORES = {
 def results_by_scene(study: Study) -> Table:
     """PSNR of every scene behind every artifact, cells ADC / MCMC, mean over seeds ± their standard deviation."""
     rows = []
-    for subject in study.subjects:
+    for subject, (metric, name) in product(study.subjects, PSNR_OVER_VIEWS.items()):
         cells = [[study.select(*subject, m, d) for d in study.densifications] for m in study.methods]
-        best = max(finite(mean(chosen, "psnr") for pair in cells for chosen in pair), default=None)
+        best = max(finite(mean(chosen, metric) for pair in cells for chosen in pair), default=None)
         if best is not None:
-            rows.append([*subject, *(format_pair([_psnr(chosen, best) for chosen in pair]) for pair in cells)])
-    headings = ["Artifact", "Scene", *map(title, study.methods)]
+            shown = (format_pair([_over_seeds(chosen, metric, best) for chosen in pair]) for pair in cells)
+            rows.append([*subject, name, *shown])
+    headings = ["Artifact", "Scene", "over views", *map(title, study.methods)]
     note = f"PSNR in dB, cells {densification_names(study)}, ± over seeds. {NOTE}"
     return Table("Results by scene", headings, rows, note)
+
+
+def by_mask(study: Study) -> Table | None:
+    """Scores by a mask of the photos' own artifact, mean over seeds; None where no scene states one."""
+    metrics = [f"outside_{metric}" for metric in PSNR_OVER_VIEWS]
+    # Photos with the artifact say nothing about what is behind it, and all about the composite.
+    metrics += ["inside_psnr"] if study.clean_tests else [f"composite_{metric}" for metric in PSNR_OVER_VIEWS]
+    rows = []
+    for subject in study.subjects:
+        masked = [r for r in study.results if (r.run.effect, r.run.scene) == subject and r.run.mask]
+        for method, densification, chosen in study.rows(masked):
+            # Without an overlay the clean render is the composite.
+            figures = [mean(chosen, m) or mean(chosen, m.removeprefix("composite_")) for m in metrics]
+            mattes = [finite(r.artifact.get(name) for r in chosen) for name in MATTES]
+            cells = ["-" if figure is None else f"{figure:.2f}" for figure in figures]
+            cells += [f"{statistics.mean(values):.3f}" if values else "" for values in mattes]
+            rows.append([*subject, title(method), densification.upper(), *cells])
+    if not rows:
+        return None
+    headings = ["outside: PSNR ↑", "median", "worst view"]
+    headings += ["inside: PSNR ↑"] if study.clean_tests else ["composite: PSNR ↑", "median", "worst view"]
+    note = (
+        "Outside: of the clean render, of pixels farther from the mask than 16 pixels of a photo. Composite: of all "
+        "pixels, against photos that show the artifact. Mean mattes inside the mask, outside, and outside in the upper "
+        "third; 0 where detection found no artifact."
+    )
+    headings = ["Artifact", "Scene", "Method", "", *headings, *MATTES.values()]
+    return Table("By a mask of the artifact", headings, rows, note)
+
+
+def by_exposure(study: Study) -> Table | None:
+    """PSNR before and after color correction, of scenes whose exposure varies; None where none does."""
+    rows = []
+    for subject in study.subjects:
+        varying = [r for r in study.results if (r.run.effect, r.run.scene) == subject and r.run.exposure]
+        for method, densification, chosen in study.rows(varying):
+            means = [mean(chosen, metric) for metric in ("psnr", "cc_psnr", "mean_color_deviation")]
+            cells = ["-" if value is None else f"{value:.2f}" for value in means]
+            rows.append([*subject, title(method), densification.upper(), *cells])
+    if not rows:
+        return None
+    note = (
+        "Test photos are at the mean exposure. Corrected: the render of each test view is brought to its photo by a "
+        "gain and an offset per channel."
+    )
+    headings = ["Artifact", "Scene", "Method", "", "PSNR ↑", "corrected PSNR ↑", "mean color deviation ↓"]
+    return Table("Under varying exposure", headings, rows, note)
 
 
 def artifact_itself(study: Study) -> Table | None:
     """How well the artifact came out; None where no overlay was learned in front of known layers."""
     rows = []
     for kind in study.categories:
-        scored = [r for r in study.results if r.artifact and category(r.run.effect) == kind]
+        scored = [r for r in study.results if "matte_iou" in r.artifact and category(r.run.effect) == kind]
         for method, densification, chosen in study.rows(scored):
             scores = [f"{statistics.mean(r.artifact[name] for r in chosen):.3f}" for name in ARTIFACT_SCORES]
             rows.append([row_name(kind), title(method), densification.upper(), *scores])
@@ -63,9 +114,9 @@ def cost(study: Study) -> Table | None:
     return Table("Cost", headings, rows, "Means over the runs that had their device to themselves.")
 
 
-def _psnr(results: list[Result], best: float) -> str:
+def _over_seeds(results: list[Result], metric: str, best: float) -> str:
     """Mean ± standard deviation over seeds; † where one diverged, bold where it is the best."""
-    value, deviation = mean(results, "psnr"), spread(finished_values(results, "psnr"))
+    value, deviation = mean(results, metric), spread(finished_values(results, metric))
     text = "-" if value is None else f"{value:.2f}"
     if deviation is not None:
         text += f" ± {deviation:.2f}"

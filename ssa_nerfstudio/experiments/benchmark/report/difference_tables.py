@@ -1,17 +1,18 @@
-"""Differences between methods: paired by test view, and the acceptance thresholds of the default."""
+"""Differences between methods, paired by test view."""
 
 from __future__ import annotations
 
-import statistics
 from itertools import product
 
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import bootstrap, paired_differences
 from ssa_nerfstudio.experiments.benchmark.report.document import Table
-from ssa_nerfstudio.experiments.benchmark.report.study import METRICS, Study, belongs, finite, mean
-from ssa_nerfstudio.experiments.benchmark.report.table_cells import FORMATS, HEADINGS, row_name
-from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, title
+from ssa_nerfstudio.experiments.benchmark.report.study import OVER_VIEWS, Study, belongs
+from ssa_nerfstudio.experiments.benchmark.report.table_cells import FORMATS, row_name
+from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, title
 
-MAIN_METHODS = ("3dgs", "default", "overlay-on", "paper", "given")
+PAIRED = ("psnr", "ssim", "flip")
+_BASELINES = tuple(name for name, method in METHODS.items() if method.baseline)
+MAIN_METHODS = ("3dgs", "default", "overlay-on", "paper", "given", *_BASELINES)
 
 
 def paired(study: Study, ours: str) -> Table | None:
@@ -19,51 +20,21 @@ def paired(study: Study, ours: str) -> Table | None:
     others = [name for name in MAIN_METHODS if name != ours and name in study.methods]
     rows = []
     for other, densification, kind in product(others, study.densifications, [*study.kinds, CLEAN]):
-        groups = [_difference_groups(study, kind, ours, other, densification, metric) for metric in METRICS]
-        cells = [_interval(group, metric) for group, metric in zip(groups, METRICS, strict=True)]
-        if any(cells):
+        groups = {m: _difference_groups(study, kind, ours, other, densification, m) for m in PAIRED}
+        if any(groups.values()):
             name = "Clean photos" if kind == CLEAN else row_name(kind)
-            rows.append([f"minus {title(other)}", densification.upper(), name, *cells])
+            cells = [_interval(group, metric) for metric, group in groups.items()]
+            decibels = [value for group in groups["psnr"] for value in group]
+            extent = [f"{over(decibels):+.2f}" if decibels else "" for over in OVER_VIEWS.values()]
+            rows.append([f"minus {title(other)}", densification.upper(), name, cells[0], *extent, *cells[1:]])
     if not rows:
         return None
     note = (
         "Paired by test view and seed; mean over scenes, with 95 % bootstrap intervals over test views: what other "
         "views of the same scenes would change, not what other scenes would."
     )
-    headings = ["", "", "Artifact", *(HEADINGS[metric][:-2] for metric in METRICS)]
+    headings = ["", "", "Artifact", "PSNR", *(f"PSNR, {over}" for over in OVER_VIEWS), "SSIM", "FLIP"]
     return Table(f"{title(ours)}: paired differences", headings, rows, note)
-
-
-def acceptance(study: Study) -> Table | None:
-    """Acceptance thresholds of the default method; None where it was not run."""
-    rows = [row for densification in study.densifications for row in _thresholds(study, densification)]
-    headings = ["", "Requirement", "difference, dB", "met"]
-    return Table("Acceptance thresholds of the default", headings, rows) if rows else None
-
-
-def _thresholds(study: Study, densification: str) -> list[list[str]]:
-    rows, differences = [], []
-
-    def psnr(effect: str, scene: str, method: str) -> float | None:
-        return mean(study.select(effect, scene, method, densification), "psnr")
-
-    def require(what: str, value: float, reference: float, margin: float) -> None:
-        met = "yes" if value >= reference - margin else "**no**"
-        rows.append([densification.upper(), what, f"{value - reference:+.2f}", met])
-
-    for effect, scene in study.pairs:
-        ours, rule, given = (psnr(effect, scene, method) for method in ("default", "paper", "given"))
-        references = finite((rule, given))
-        if ours is not None and references:
-            require(f"{scene}, {effect}: better of paper's rule and oracle, minus 0.2", ours, max(references), 0.2)
-            differences += [ours - given] if given is not None else []
-    if differences:
-        require("mean over all: not below the oracle", statistics.mean(differences), 0.0, 0.0)
-    for scene in study.scenes:
-        on, off = psnr(CLEAN, scene, "overlay-on"), psnr(CLEAN, scene, "3dgs")
-        if on is not None and off is not None:
-            require(f"{scene}, clean: overlay on within 0.1 of off", on, off, 0.1)
-    return rows
 
 
 def _difference_groups(

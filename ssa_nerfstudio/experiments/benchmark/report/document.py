@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ssa_nerfstudio.experiments.html_page import render_page
+from ssa_nerfstudio.workflow.html_page import render_page
+
+_TEMPLATES = Path(__file__).parents[2] / "templates"
 
 
 @dataclass
@@ -47,6 +49,8 @@ class Document:
         folder.mkdir(parents=True, exist_ok=True)
         paths = [folder / f"{name}.md", folder / f"{name}.html"]
         for path in paths:
-            text = render_page(f"benchmark{path.suffix}", self.title, sections=self.sections, folder=folder)
+            text = render_page(
+                _TEMPLATES / f"benchmark{path.suffix}", self.title, sections=self.sections, folder=folder
+            )
             path.write_text(text, encoding="utf-8")
         return paths

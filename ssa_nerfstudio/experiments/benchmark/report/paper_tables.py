@@ -7,7 +7,8 @@ from typing import Any
 from ssa_nerfstudio.experiments.configuration import locate, read
 
 Triple = tuple[float, float, float]
-"""PSNR (dB), SSIM, FLIP."""
+METRICS = ("psnr", "ssim", "flip")
+"""What a triple holds; PSNR in dB."""
 
 
 def _flat(table: dict[str, Any]) -> dict[Any, Triple]:

@@ -10,7 +10,10 @@ from itertools import product
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, category
 
-METRICS = ("psnr", "ssim", "flip")
+METRICS = ("psnr", "psnr median", "psnr worst", "ssim", "flip")
+"""A metric's name alone stands for its mean over the test views."""
+OVER_VIEWS = {"median": statistics.median, "worst": min}
+"""What else is taken of a run's views; one bad view in sixteen moves a mean by as much as methods differ."""
 CATEGORY_ORDER = ("watermark", "ui", "dashboard", "rain", "mud", "finger", "occlusion", "vignette", "dust")
 MEAN = "mean"
 """Stands for all categories of artifacts."""
@@ -36,12 +39,15 @@ class Study:
     steps: int
     effect_seed: int
     results: list[Result]
+    clean_tests: bool = True
+    """Whether the test photos are clean."""
 
     @property
     def title(self) -> str:
         """For headings."""
         other = f", other artifacts (effect seed {self.effect_seed})" if self.effect_seed else ""
-        return f"{self.steps:,} steps{other}"
+        marred = "" if self.clean_tests else ", test photos with the artifact"
+        return f"{self.steps:,} steps{other}{marred}"
 
     @property
     def real(self) -> bool:
@@ -114,16 +120,16 @@ class Study:
 
 
 def studies(results: list[Result]) -> list[Study]:
-    """Groups of equal length and equal effect seed; clean photos belong to every effect seed. Longest groups first."""
+    """Groups of equal length and equal effect seed; clean photos belong to every effect seed. Longest groups first.
+
+    Captures without clean test photos are groups of their own.
+    """
     usable = [r for r in results if r.status != "failed" and not r.run.marks]
-    keys = {(r.run.steps, r.run.effect_seed) for r in usable if r.run.effect != CLEAN and not r.run.real}
-    keys |= {(r.run.steps, 0) for r in usable}
     found = []
-    for steps, seed in keys:
-        alike = [r for r in usable if r.run.steps == steps]
-        chosen = [r for r in alike if r.run.effect_seed == seed or r.run.effect == CLEAN or r.run.real]
-        if seed == 0 or any(r.run.effect != CLEAN for r in chosen):
-            found.append(Study(steps, seed, chosen))
+    for steps, seed, clean_tests in {(r.run.steps, r.run.effect_seed, r.run.clean_tests) for r in usable}:
+        alike = [r for r in usable if r.run.steps == steps and r.run.clean_tests == clean_tests]
+        chosen = [r for r in alike if r.run.effect_seed == seed or r.run.effect == CLEAN]
+        found.append(Study(steps, seed, chosen, clean_tests))
     return sorted(found, key=lambda study: (-len(study.results), study.steps, study.effect_seed))
 
 
@@ -133,8 +139,13 @@ def finite(values: Iterable[float | None]) -> list[float]:
 
 
 def finished_values(results: Iterable[Result], metric: str) -> list[float]:
-    """A metric of the runs that finished, where it is a number."""
-    return finite(r.metrics.get(metric) for r in results if r.status == "finished")
+    """A metric of the runs that finished, where it is a number: "psnr", or over the views "psnr worst"."""
+    name, _, over = metric.partition(" ")
+    finished = [r for r in results if r.status == "finished"]
+    if not over:
+        return finite(r.metrics.get(name) for r in finished)
+    of_views = (finite(view.get(name) for view in r.views.values()) for r in finished)
+    return [OVER_VIEWS[over](values) for values in of_views if values]
 
 
 def mean(results: Sequence[Result], metric: str) -> float | None:

@@ -8,8 +8,15 @@ from collections.abc import Iterable
 from ssa_nerfstudio.experiments.benchmark.report.study import MEAN, Study, Value
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN
 
-HEADINGS = {"psnr": "PSNR ↑", "ssim": "SSIM ↑", "flip": "FLIP ↓", "mean_color_deviation": "color deviation ↓"}
-FORMATS = {"psnr": "{:.2f}", "ssim": "{:.3f}", "flip": "{:.3f}", "mean_color_deviation": "{:.2f}"}
+HEADINGS = {
+    "psnr": "PSNR ↑",
+    "psnr median": "median",
+    "psnr worst": "worst view",
+    "ssim": "SSIM ↑",
+    "flip": "FLIP ↓",
+    "mean_color_deviation": "color deviation ↓",
+}
+FORMATS = {name: "{:.3f}" if name in ("ssim", "flip") else "{:.2f}" for name in HEADINGS}
 _ROW_NAMES = {CLEAN: "Clean (Ref)", MEAN: "Mean", "ui": "UI elements", "rain": "Rain spots"}
 NOTE = "† a run diverged and is left out; (n/m): n of m scenes are there. Best of a row and metric in bold."
 

@@ -31,6 +31,14 @@ class SceneEntry:
     """Every so many photos one tests, where transforms.json states no split."""
     artifact: str | None = None
     """What its training photos carry already (finger, mud, occlusion): then no effect is put in front of them."""
+    clean: str | None = None
+    """Folder in it with a clean counterpart of every photo, under the same name: what the effect `none` trains on."""
+    mask: str | None = None
+    """Picture in it, white where the artifact of a raw photo may be. Scores are taken by it; no training sees it."""
+    clean_tests: bool = True
+    """False: its test photos carry the artifact, too, and the clean render is compared outside the mask alone."""
+    exposure: float = 0.0
+    """How much the training photos' exposure varies (`simulation.scene.SceneFile.exposure`); drawn by `effect_seed`."""
     cap_max: int | None = None
     """Largest number of Gaussians under MCMC; the method's own where not given."""
     model: dict[str, Any] = field(default_factory=dict)
@@ -39,8 +47,14 @@ class SceneEntry:
     def __post_init__(self) -> None:
         if self.downscale < 1 or self.eval_interval < 2:
             raise ValueError(f"{self.title}: downscale must be at least 1 and eval_interval at least 2")
+        if not 0 <= self.exposure <= 1 or (self.exposure and self.artifact):
+            raise ValueError(f"{self.title}: exposure must be in [0, 1], and 0 where the photos carry an artifact")
         if not re.fullmatch(r"[A-Za-z0-9_.]+", self.title):
             raise ValueError(f"scene name {self.title!r} must consist of letters, digits, _ and dots; state one: name")
+        if self.artifact is None and (self.clean or self.mask or not self.clean_tests):
+            raise ValueError(f"{self.title}: clean, mask and clean_tests are for scenes that state their artifact")
+        if not self.clean_tests and self.mask is None:
+            raise ValueError(f"{self.title}: without clean test photos, a mask of the artifact is needed")
 
     @property
     def title(self) -> str:
@@ -55,7 +69,8 @@ class Part:
     methods: tuple[str, ...]
     """Rows of the matrix (`benchmark.matrix.METHODS`), or candidates of the file."""
     effects: tuple[str, ...] = ("none",)
-    """Effects of `ssa simulate`, and `none`: clean photos. Of scenes that carry an artifact already, ignored."""
+    """Effects of `ssa simulate`, and `none`: clean photos. Scenes that carry an artifact already have that instead,
+    and `none` where they have clean counterparts."""
     scenes: tuple[str, ...] | None = None
     """Names of scenes; all where not given."""
     densification: tuple[Densification, ...] = ("adc",)
@@ -125,7 +140,7 @@ class Benchmark:
     model: dict[str, Any] = field(default_factory=dict)
     """Settings of the model for all runs."""
     candidates: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """More methods: name to settings that replace the default's, with the overlay on."""
+    """More methods: name to settings that replace those of a row, `method`; without one the default's, overlay on."""
     tradeoff: Tradeoff | None = None
     """What `ssa tradeoff` does with this file."""
     name: str = ""
@@ -142,6 +157,7 @@ class Benchmark:
             if name in METHODS:
                 raise ValueError(f"candidate {name!r} has the name of a method; choose another")
             _check_names(self.candidates[name], f"a setting of candidate {name!r}")
+            _require((self.candidates[name].get("method", "default"),), [*METHODS], "method")
         _check_names(self.candidates, "a candidate")
         for part in self.parts:
             _require(part.methods, known, "method")

@@ -21,6 +21,10 @@ class Method:
     """Start from the overlay settings that `ssa-splatfacto` ships with, whatever method the benchmark starts from."""
     weight_by_category: bool = False
     """The paper's rule for the sparsity weight."""
+    truth: str = ""
+    """What it is handed of the artifact: `layers` (T and B) or `area`; where that is not known it is not run."""
+    baseline: str = ""
+    """Module of `benchmark.baselines` that replaces the overlay; `model` then holds its settings, too."""
 
 
 METHODS: dict[str, Method] = {
@@ -28,13 +32,22 @@ METHODS: dict[str, Method] = {
     "default": Method("SSA, default", shipped_overlay=True),
     "overlay-on": Method("SSA, default, overlay on", {"overlay": "on"}, shipped_overlay=True),
     "paper": Method("SSA, paper's rule", _PAPER, weight_by_category=True),
-    "given": Method("oracle overlay", {"overlay": "given"}),
+    "given": Method("oracle overlay", {"overlay": "given"}, truth="layers"),
     "constant-start": Method(
         "SSA, paper's rule, constant start", {**_PAPER, "overlay_start": "constant"}, weight_by_category=True
     ),
     "l1-0": Method("SSA, l1 0", {**_PAPER, "sparsity_weight": 0.0}),
     "l1-0.01": Method("SSA, l1 0.01", {**_PAPER, "sparsity_weight": 0.01}),
     "l1-0.05": Method("SSA, l1 0.05", {**_PAPER, "sparsity_weight": 0.05}),
+    "robustnerf": Method("RobustNeRF", baseline="robustnerf"),
+    "spotless-mlp": Method("SpotLessSplats mlp, hand-made features", {"grouping": "mlp"}, baseline="spotless"),
+    "spotless-agg": Method("SpotLessSplats agg, hand-made features", {"grouping": "agg"}, baseline="spotless"),
+    "desplat": Method("DeSplat", baseline="desplat"),
+    "dc-gaussian": Method("DC-Gaussian (win)", baseline="dc_gaussian"),
+    "difix3d": Method("Difix3D+", baseline="difix3d"),
+    "flux-kontext": Method("FLUX.1 Kontext, then 3DGS", baseline="flux_kontext"),
+    "mask-true": Method("3DGS, true mask", {"mask_from": "truth"}, truth="area", baseline="photo_masks"),
+    "mask-detected": Method("3DGS, detected mask", {"mask_from": "detection"}, baseline="photo_masks"),
 }
 """Methods by the name that benchmark files use."""
 CLEAN = "none"

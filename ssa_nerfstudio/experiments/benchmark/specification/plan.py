@@ -9,11 +9,13 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
-from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark, SceneEntry
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark, Part, SceneEntry
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, paper_weight
 
 RUN_KNOBS = ("steps", "image_scale", "densification")
 """What a tradeoff can vary beside settings of the model."""
+LATER = ("counterparts", "mask", "clean_tests", "baseline", "exposure")
+"""Fields that came later: at their defaults they are no part of an id, so that earlier results keep theirs."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,16 @@ class Run:
     """Steps after which the test views are evaluated, besides the end; increasing."""
     variation: dict[str, Any] = field(default_factory=dict)
     """Knobs that a tradeoff set for this run."""
+    counterparts: str = ""
+    """Folder of the dataset with the clean photos that it trains on, in place of those with the artifact."""
+    mask: str = ""
+    """File of the dataset: where the artifact of a raw photo may be."""
+    clean_tests: bool = True
+    """Whether test photos are clean."""
+    baseline: str = ""
+    """Module of `benchmark.baselines` whose model is trained; empty: the method's own."""
+    exposure: float = 0.0
+    """How much the training photos' exposure varies."""
 
     def value(self, knob: str) -> Any:
         """What it sets a tradeoff's knob to, varied or not; None: whatever the method's default is."""
@@ -57,7 +69,9 @@ class Run:
     @property
     def id(self) -> str:
         """A name for people and files; equal for equal runs, on every machine."""
-        values = json.dumps(dataclasses.asdict(self), sort_keys=True, default=str)
+        usual = {each.name: each.default for each in dataclasses.fields(self) if each.name in LATER}
+        stated = {name: value for name, value in dataclasses.asdict(self).items() if value != usual.get(name, ...)}
+        values = json.dumps(stated, sort_keys=True, default=str)
         digest = hashlib.sha256(values.encode()).hexdigest()[:8]
         parts = [self.scene, self.effect, self.method, self.densification, str(self.steps), f"s{self.seed}"]
         return "-".join([*parts, *(f"{k}={v}" for k, v in self.variation.items() if k not in RUN_KNOBS), digest])
@@ -72,26 +86,27 @@ class Run:
         """Name of the folder of its prepared dataset; runs that share it train on the same photos."""
         seed = f"-e{self.effect_seed}" if self.effect_seed else ""
         reduced = f"-div{self.downscale}" if self.downscale > 1 else ""
-        return f"{self.scene}-{'captured' if self.real else self.effect}{seed}{reduced}"
+        varied = f"-exposure{self.exposure:g}" if self.exposure else ""
+        return f"{self.scene}-{'captured' if self.real else self.effect}{varied}{seed}{reduced}"
 
 
 def plan(benchmark: Benchmark) -> list[Run]:
     """The runs of all parts in their order, each once.
 
-    Left out is the oracle overlay of clean photos, which have none, and of real artifacts, whose layers are unknown.
+    Left out are methods that are handed a truth where it is not known: clean photos, real artifacts without a mask.
     """
     runs: dict[str, Run] = {}
     for part in benchmark.parts:
         names = part.scenes or [scene.title for scene in benchmark.scenes]
         for densification, seed, name in product(part.densification, part.seeds, names):
             scene = benchmark.scene(name)
-            effects = part.effects if scene.artifact is None else (scene.artifact,)
+            effects = part.effects if scene.artifact is None else _own_effects(scene, part)
             for effect, method in product(effects, part.methods):
-                if method == "given" and (scene.artifact is not None or effect == CLEAN):
+                if not _has_truth(METHODS[_row(benchmark, method)].truth, scene, effect):
                     continue
                 run = _run(benchmark, scene, effect, method, densification, part.steps)
                 # Nothing decides where nothing is drawn.
-                drawn = 0 if effect == CLEAN or run.real else part.effect_seed
+                drawn = 0 if (effect == CLEAN and not run.exposure) or run.real else part.effect_seed
                 run = dataclasses.replace(run, seed=seed, effect_seed=drawn)
                 runs.setdefault(run.id, run)
     return list(runs.values())
@@ -146,15 +161,32 @@ def _varied(benchmark: Benchmark, scene: SceneEntry, effect: str, seed: int, var
     )
 
 
+def _row(benchmark: Benchmark, method: str) -> str:
+    """The row of the matrix that a method, or a candidate of the file, starts from."""
+    return method if method in METHODS else benchmark.candidates[method].get("method", "overlay-on")
+
+
+def _has_truth(truth: str, scene: SceneEntry, effect: str) -> bool:
+    """Whether a method can be handed the truth that it needs."""
+    known = effect != CLEAN and (scene.artifact is None or (truth == "area" and scene.mask is not None))
+    return known or not truth
+
+
+def _own_effects(scene: SceneEntry, part: Part) -> tuple[str, ...]:
+    """The artifact that the scene carries, and none of it where the part asks for that and it can be had."""
+    assert scene.artifact is not None
+    return (CLEAN, scene.artifact) if scene.clean and CLEAN in part.effects else (scene.artifact,)
+
+
 def _run(benchmark: Benchmark, scene: SceneEntry, effect: str, method: str, densification: str, steps: int) -> Run:
-    real = scene.artifact is not None
-    row = METHODS.get(method, METHODS["overlay-on"])
+    real = scene.artifact is not None and effect != CLEAN
+    row = METHODS[_row(benchmark, method)]
     model: dict[str, Any] = {**benchmark.model, **scene.model, "strategy": densification, **row.model}
     if scene.cap_max is not None and densification == "mcmc":
         model["cap_max"] = scene.cap_max
     if row.weight_by_category:
         model["sparsity_weight"] = paper_weight(effect, real)
-    model |= benchmark.candidates.get(method, {})
+    model |= {name: v for name, v in benchmark.candidates.get(method, {}).items() if name != "method"}
     model = {name: _switch(value) if name == "overlay" else value for name, value in model.items()}
     return Run(
         scene=scene.title,
@@ -171,6 +203,11 @@ def _run(benchmark: Benchmark, scene: SceneEntry, effect: str, method: str, dens
         nerfstudio_method=benchmark.method,
         shipped_overlay=row.shipped_overlay,
         model=model,
+        counterparts="" if real or scene.clean is None else scene.clean,
+        mask=scene.mask or "",
+        clean_tests=scene.clean_tests,
+        baseline=row.baseline,
+        exposure=scene.exposure,
     )
 
 

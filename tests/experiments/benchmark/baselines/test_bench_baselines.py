@@ -1,0 +1,91 @@
+"""Baselines through `ssa bench` as a user calls it: real processes, seconds each.
+
+One each that changes the loss, the photos, the scene and the composite. The others are trained in tests of their own.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from nerfstudio.utils.eval_utils import eval_setup
+
+from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.experiments.benchmark.results import read_all
+
+WITH_WEIGHTS = ("difix3d", "flux-kontext")
+BASELINES = ["spotless-mlp", "mask-detected", "desplat", "dc-gaussian"]
+FILE = """
+scenes:
+  - data: demo
+    model: {{num_downscales: 0, densify_grad_thresh: 0.006}}
+parts:
+  - {{methods: [{methods}], effects: [dashboard], steps: 12}}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("baselines")
+    (folder / "few.yaml").write_text(FILE.format(methods=", ".join(BASELINES)))
+    command = [
+        sys.executable,
+        "-m",
+        "ssa_nerfstudio",
+        "bench",
+        folder / "few.yaml",
+        "--output",
+        folder,
+        "--keep-models",
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=600)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    return folder
+
+
+@pytest.mark.slow
+def test_each_one_is_trained_judged_and_timed_like_any_other_method(folder):
+    results, problems = read_all([folder])
+    assert problems == []
+    assert {result.run.method: result.status for result in results} == dict.fromkeys(BASELINES, "finished")
+    psnr: dict[str, Any] = {result.run.method: result.metrics["psnr"] for result in results}
+    assert min(psnr.values()) > 8
+    assert len({*psnr.values()}) == len(BASELINES)
+    assert all(result.seconds["training"] > 0 for result in results)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", BASELINES)
+def test_nerfstudio_loads_what_was_trained(folder, method):
+    (result,) = (result for result in read_all([folder])[0] if result.run.method == method)
+    (config,) = (folder / "models" / result.run.id).rglob("config.yml")
+    pipeline: Any = eval_setup(config, test_mode="inference", update_config_callback=_moved(config))[1]
+    camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]
+    assert torch.isfinite(pipeline.model.get_outputs_for_camera(camera)["rgb"]).all()
+    assert len(pipeline.model.means) == result.gaussians
+
+
+@pytest.mark.parametrize("method", WITH_WEIGHTS)
+def test_without_weights_nothing_begins_and_one_line_says_what_to_fetch(tmp_path, capsys, method):
+    (tmp_path / "few.yaml").write_text(FILE.format(methods=method))
+    with pytest.raises(SystemExit) as refusal:
+        main(["bench", str(tmp_path / "few.yaml"), "--output", str(tmp_path / "results")])
+    assert refusal.value.code == 2
+    line = capsys.readouterr().err
+    assert "licence" in line
+    assert len(line.strip().splitlines()) == 1
+    assert not (tmp_path / "results" / "scenes").exists()
+
+
+def _moved(config: Path):
+    def update(stated):
+        stated.output_dir = config.parents[3]
+        return stated
+
+    return update

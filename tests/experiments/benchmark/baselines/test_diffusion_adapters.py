@@ -1,0 +1,132 @@
+"""Difix3D+ and FLUX.1 Kontext with diffusers' own classes and tiny random weights that the tests make."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from baselines.training import photos_of, train
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.baselines import diffusion_weights, flux_kontext
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Capture
+
+pytest.importorskip("diffusers", reason="pip install '.[diffusion]'")
+
+
+@pytest.fixture(scope="module")
+def difix(tmp_path_factory) -> Path:
+    from baselines.tiny_diffusion import save_difix
+
+    return save_difix(tmp_path_factory.mktemp("difix"))
+
+
+@pytest.fixture(scope="module")
+def flux(tmp_path_factory) -> dict[str, Any]:
+    from baselines.tiny_diffusion import save_flux
+
+    weights = save_flux(tmp_path_factory.mktemp("flux"))
+    return {"weights": str(weights), "area": 64 * 48, "restoration_steps": 2, "batch": 3}
+
+
+def test_difix_enhances_test_renders_of_any_size_with_the_nearest_photo(capture, difix, tmp_path):
+    _, pipeline = train("difix3d", capture("clean"), tmp_path, 4, weights=str(difix), area=96 * 64)
+    model: Any = pipeline.model
+    model.eval()
+    camera = pipeline.datamanager.train_dataset.cameras[5:6]
+    enhance = type(model).enhance
+    drawn = model.get_outputs(camera)
+    assert drawn["rgb"].shape == drawn["rendered"].shape == (48, 64, 3)
+    assert not torch.allclose(drawn["rgb"], drawn["rendered"], atol=0.02)
+    assert torch.equal(drawn["rgb"], enhance(model, drawn["rendered"], 5))  # its own photo is the nearest
+    code = next(module for name, module in sys.modules.items() if name.endswith("pipeline_difix"))
+    assert code.DifixPipeline.asked == ("remove degradation", (88, 64), (88, 64), [199], 0.0)
+
+
+def test_difix_does_not_touch_training(capture, difix, tmp_path):
+    _, enhanced = train("difix3d", capture("clean"), tmp_path / "a", 4, weights=str(difix), area=96 * 64)
+    _, plain = train("3dgs", capture("clean"), tmp_path / "b", 4)
+    assert torch.equal(enhanced.model.means, plain.model.means)
+
+
+def restored(folder: Path) -> list[np.ndarray]:
+    return [np.array(Image.open(path)) for path in photos_of(folder)]
+
+
+def test_flux_restores_every_training_photo_and_leaves_the_rest(capture, flux, tmp_path):
+    source = capture("dashboard")
+    flux_kontext.write_dataset(Capture(source, "dashboard", None, flux), tmp_path / "restored")
+    assert [photo.shape for photo in restored(tmp_path / "restored")] == [(48, 64, 3)] * 24
+    before, after = (json.loads((f / "transforms.json").read_text()) for f in (source, tmp_path / "restored"))
+    assert after["test_filenames"] == before["test_filenames"]
+    assert [frame["transform_matrix"] for frame in after["frames"]] == [f["transform_matrix"] for f in before["frames"]]
+    record = json.loads((tmp_path / "restored" / "restoration.json").read_text())
+    assert record["prompt"] == "remove the car dashboard occluding the view"
+    assert record["seconds"] > 0
+
+
+def test_flux_goes_on_where_it_was_interrupted_with_the_same_result(capture, flux, tmp_path, monkeypatch):
+    made = Capture(capture("dashboard"), "dashboard", None, flux)
+    flux_kontext.write_dataset(made, tmp_path / "whole")
+    resized_back, done = flux_kontext.resized_back, []
+
+    def interrupted(*arguments):
+        done.append(arguments)
+        if len(done) > 5:
+            raise KeyboardInterrupt
+        return resized_back(*arguments)
+
+    monkeypatch.setattr(flux_kontext, "resized_back", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        flux_kontext.write_dataset(made, tmp_path / "part")
+    assert not (tmp_path / "part").exists()
+    assert len(list((tmp_path / ".part.restored").glob("*.png"))) == 5
+    monkeypatch.undo()
+    flux_kontext.write_dataset(made, tmp_path / "part")
+    assert json.loads((tmp_path / "part" / "restoration.json").read_text())["photos"] == 24 - 5
+    for ours, theirs in zip(restored(tmp_path / "part"), restored(tmp_path / "whole"), strict=True):
+        # Other photos share a batch, which rounds differently.
+        np.testing.assert_allclose(ours.astype(int), theirs.astype(int), atol=2)
+
+
+def test_flux_trains_3dgs_on_what_it_restored(capture, flux, tmp_path):
+    outcome, pipeline = train("flux-kontext", capture("dashboard"), tmp_path, 4, **flux)
+    assert "restored" in str(pipeline.datamanager.train_dataset.image_filenames[0])
+    assert outcome.metrics["psnr"] > 5
+
+
+@pytest.mark.parametrize("content", ["nothing", "no folder", "a broken index"])
+def test_a_folder_that_holds_no_weights_is_refused_in_one_line(tmp_path, content):
+    folder = tmp_path / "weights"
+    if content != "no folder":
+        folder.mkdir()
+    if content == "a broken index":
+        (folder / "model_index.json").write_text("{")
+    with pytest.raises(InputError, match=re.escape(flux_kontext.WEIGHTS)) as refusal:
+        diffusion_weights.load(
+            str(folder), flux_kontext.WEIGHTS, torch.device("cpu"), offload=False, kind="FluxKontextPipeline"
+        )
+    assert "\n" not in str(refusal.value)
+
+
+def test_too_little_memory_is_one_line_with_a_remedy():
+    with (
+        pytest.raises(InputError, match="too little memory for flux; set offload"),
+        diffusion_weights.enough_memory("flux"),
+    ):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20 GiB")
+
+
+@pytest.mark.parametrize(("width", "height"), [(960, 720), (540, 960), (848, 480), (64, 48)])
+def test_a_pipeline_gets_the_aspect_of_the_photo_at_its_own_resolution(width, height):
+    fitted = diffusion_weights.fitted(width, height, 576 * 1024, 16)
+    assert all(side % 16 == 0 for side in fitted)
+    assert fitted[0] * fitted[1] == pytest.approx(576 * 1024, rel=0.04)
+    assert fitted[0] / fitted[1] == pytest.approx(width / height, rel=0.03)
