@@ -3,7 +3,9 @@
 #   make demo DATA=folder      the same comparison on your nerfstudio dataset
 #   make docs                  the documentation as a site, in site/
 #   make test, make lint       what .ci/run runs, with make docs and make bare
+#   make slow                  the tests of half a minute and more: whole trainings, structure from motion, real photos
 #   make bare                  the product alone, without experiments, in an environment of its own (.venv-bare)
+#   make mutants ROOM=overlay  which changes of a folder its tests notice (docs/testing.md)
 #   make stability             every hard case, the long ones too (docs/stability.md)
 
 VENV := .venv
@@ -14,9 +16,10 @@ BARE := .venv-bare
 PYTHON ?= $(shell for p in python3.12 python3.11 python3.10 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 10) <= sys.version_info[:2] < (3, 13))' 2>/dev/null && echo $$p && break; done)
 DATA ?=
+ROOM ?= overlay
 DEMO_OPTIONS ?=
 
-.PHONY: setup demo docs test stability lint bare format clean
+.PHONY: setup demo docs test slow mutants stability lint bare format clean
 
 setup: $(READY)
 
@@ -36,6 +39,12 @@ docs: $(READY)
 
 test: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+slow: $(READY)
+	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+
+mutants: $(READY)
+	$(BIN)/python benchmarks/mutants.py --room $(ROOM)
 
 stability: $(READY)
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "stability or not stability" tests/stability tests/plugin/training/test_nonfinite.py tests/plugin/training/test_checkpoints.py
