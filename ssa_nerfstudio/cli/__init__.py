@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import importlib
+import io
+import os
+import signal
 import sys
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 
 from ssa_nerfstudio._system import terminal_messages
 from ssa_nerfstudio.errors import InputError, SSAError
 
 COMMANDS = {
+    "run": "From photos to clean splats, the artifact as a picture, and a report; resumable.",
     "bench": "Train and score a matrix of scenes, artifacts, methods and seeds; resumable.",
     "demo": "Build a small scene, add artifacts to its photos, train without and with the overlay, and report.",
     "detect": "Say whether photos have a static screen-space artifact, and where.",
     "process": "Make a nerfstudio dataset from photos or videos, with poses robust to a static artifact.",
     "report": "Tables and pictures from the results of ssa bench.",
     "simulate": "Add an artifact to the training photos of a nerfstudio dataset.",
+    "export-dataset": "Write a capture with masks, or with cleaned photos, as another program reads it.",
     "export-overlay": "Write the artifact that a run learned as pictures and masks, and remove it from photos.",
     "export-splats": "Write a run's clean splats as PLY, as ns-export gaussian-splat does, and compressed.",
     "tradeoff": "What accuracy costs in time: one knob at a time and a few together, with frontier and knee.",
@@ -34,17 +41,17 @@ def main(arguments: list[str] | None = None) -> None:
         arguments: what follows `ssa`; the process's own where None.
     """
     arguments = sys.argv[1:] if arguments is None else arguments
-    if not arguments or arguments[0] in ("-h", "--help"):
-        print(_usage())
-        raise SystemExit(0 if arguments else 2)
-    name, *rest = arguments
-    if name in ("-V", "--version"):
-        from ssa_nerfstudio import __version__
+    asks_for_help = not arguments or arguments[0] in ("-h", "--help")
+    with _errors_in_one_line("ssa" if asks_for_help else f"ssa {arguments[0]}"):
+        if asks_for_help:
+            print(_usage(), flush=True)
+            raise SystemExit(0 if arguments else 2)
+        if arguments[0] in ("-V", "--version"):
+            from ssa_nerfstudio import __version__
 
-        print(__version__)
-        return
-    with _errors_in_one_line(f"ssa {name}"):
-        _run(name, rest)
+            print(__version__)
+            return
+        _run(arguments[0], arguments[1:])
 
 
 def run_script(command: type) -> None:
@@ -66,10 +73,23 @@ def run_script(command: type) -> None:
 def _errors_in_one_line(program: str) -> Iterator[None]:
     terminal_messages.show_warnings()
     warnings.simplefilter("ignore", FutureWarning)  # raised by libraries at import; no user can act on them
+    warnings.filterwarnings("ignore", ".*The TBB threading layer")  # numba's, about a library of the system
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
     try:
         yield
+        sys.stdout.flush()
     except SSAError as error:
         raise SystemExit(terminal_messages.print_error(error)) from None
+    except BrokenPipeError:  # as of `| head`: who read the output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        raise SystemExit(terminal_messages.BROKEN_PIPE_EXIT_CODE) from None
+    except OSError as error:
+        refused = terminal_messages.refusal(error)
+        if refused is None:
+            raise
+        raise SystemExit(terminal_messages.print_error(refused)) from None
     except KeyboardInterrupt as interrupt:
         print(str(interrupt) or f"{program} was stopped", file=sys.stderr)
         raise SystemExit(terminal_messages.INTERRUPTED_EXIT_CODE) from None
@@ -78,17 +98,38 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
 def _run(name: str, options: list[str]) -> None:
     if name not in COMMANDS:
         raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")
-    from ssa_nerfstudio.cli import arguments
-
-    command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
     try:
-        arguments.read(command, options, f"ssa {name}", COMMANDS[name]).run()
+        with _ended_by_ctrl_c(f"ssa {name}"):
+            from ssa_nerfstudio.cli import arguments
+
+            command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
+            read = getattr(command, "read", partial(arguments.read, command))
+            requested = read(options, f"ssa {name}", COMMANDS[name])
+        requested.run()
     except ImportError as error:  # also of a library that misses an optional package of its own
         if name not in EXPERIMENTS or (error.name or "").startswith("ssa_nerfstudio"):
             raise
         raise InputError(
             f"ssa {name} needs a package that is not installed ({error})", "pip install 'ssa-nerfstudio[experiments]'"
         ) from error
+
+
+@contextmanager
+def _ended_by_ctrl_c(program: str) -> Iterator[None]:
+    """End the process on ctrl+c: nothing has begun, and libraries make other errors of an interrupted import."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(_signal: int, _frame: object) -> None:
+        os.write(2, f"{program} was stopped\n".encode())
+        os._exit(terminal_messages.INTERRUPTED_EXIT_CODE)
+
+    before = signal.signal(signal.SIGINT, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _usage() -> str:

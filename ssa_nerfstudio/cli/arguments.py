@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Sequence
 from contextlib import redirect_stderr
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 
@@ -14,14 +15,15 @@ from ssa_nerfstudio.errors import InputError
 T = TypeVar("T")
 
 
-def read(command: type[T], arguments: list[str], program: str, description: str) -> T:
+def read(command: type[T], arguments: list[str], program: str, description: str, **defaults: Any) -> T:
     """Build a command from its options.
 
     Args:
-        command: a flat dataclass.
+        command: a dataclass, flat unless `defaults` are given.
         arguments: what follows the command's name.
         program: the command as it is called, for messages: `ssa detect`.
         description: what --help says first.
+        defaults: `default`, an instance whose values hold where no option is given.
 
     Raises:
         InputError: an option is unknown, missing, or has a value that it does not take.
@@ -30,11 +32,29 @@ def read(command: type[T], arguments: list[str], program: str, description: str)
     report = io.StringIO()
     try:
         with redirect_stderr(report):
-            return tyro.cli(command, args=arguments, prog=program, description=description)
+            return tyro.cli(command, args=arguments, prog=program, description=description, **defaults)
     except SystemExit as end:
         if not end.code:
             raise
     raise InputError(f"{_one_line(report.getvalue())} ({program} --help)")
+
+
+def split_forwarded(arguments: list[str], prefixes: Sequence[str]) -> tuple[list[str], tuple[tuple[str, ...], ...]]:
+    """Split off the options of other commands: `--PREFIX.NAME`, with the values that follow.
+
+    Returns:
+        The command's own arguments, and for each prefix those of the other command, as it takes them.
+    """
+    own: list[str] = []
+    theirs: dict[str, list[str]] = {f"--{prefix}.": [] for prefix in prefixes}
+    place = own
+    for word in arguments:
+        if word.startswith("--"):
+            mark = next((mark for mark in theirs if word.startswith(mark)), "")
+            place = theirs.get(mark, own)
+            word = f"--{word[len(mark) :]}" if mark else word
+        place.append(word)
+    return own, tuple(tuple(words) for words in theirs.values())
 
 
 def _one_line(report: str) -> str:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.errors import InputError, TrainingError
 
 if TYPE_CHECKING:
+    from ssa_nerfstudio.experiments.benchmark.results import Result
     from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark
     from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 
@@ -23,7 +27,7 @@ class Command:
     output: Path
     """Folder of the results; an earlier one is brought up to date, a finished run is never repeated."""
     benchmark: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="BENCHMARK")] = "smoke"
-    """smoke, captures, captures-cpu, mipnerf360, two-pass, or a .yaml file."""
+    """smoke, captures, baselines, captures-cpu, mipnerf360, two-pass, or a .yaml file."""
     scenes: tuple[str, ...] = ()
     """Only these scenes."""
     only: tuple[str, ...] = ()
@@ -51,6 +55,7 @@ class Command:
 
         Raises:
             InputError: the arguments, the benchmark or a capture cannot be worked with.
+            TrainingError: runs failed.
         """
         from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
         from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
@@ -59,33 +64,33 @@ class Command:
         runs = plan(benchmark)
         if not runs:
             raise InputError(f"{self.benchmark} states no parts", f"`ssa tradeoff {self.benchmark}` may be meant")
-        left = update(self, "bench", benchmark, runs)
-        if left == 0 and not (self.prepare_only or self.list):
-            print(f"All {self.benchmark} runs that were requested are done: ssa report {self.output}")
+        left, failed = update(self, "bench", benchmark, runs)
+        require_none(failed)
+        if not (left or self.prepare_only or self.list):
+            print(f"All {self.benchmark} runs that were requested are done: ssa report {shlex.quote(str(self.output))}")
 
 
-def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]) -> int:
-    """What bench and tradeoff share: brings the folder up to date with the runs; how many are left, or failed."""
-    from rich.console import Console
+def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]) -> tuple[list[Run], list[Result]]:
+    """What bench and tradeoff share: brings the folder up to date with the runs; those that are left, or failed."""
 
     from ssa_nerfstudio.experiments.benchmark.execution import execute as bench
     from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
     from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import store_plan
-    from ssa_nerfstudio.experiments.benchmark.results import merge, read_all
+    from ssa_nerfstudio.experiments.benchmark.results import Result, merge, read_all
 
     for option in ("runs_per_device", "threads"):
         if getattr(command, option) < 1:
             raise InputError(f"--{option.replace('_', '-')} must be at least 1, got {getattr(command, option)}")
-    if command.time_limit is not None and command.time_limit <= 0:
+    if command.time_limit is not None and not 0 < command.time_limit < math.inf:
         raise InputError(f"--time-limit must be a positive number of minutes, got {command.time_limit:g}")
     runs = bench.select(planned, command.scenes, command.only)
     place = bench.reach(command.output)
-    console = Console(highlight=False, soft_wrap=True)
+    console = plain_console()
     if command.list:
         done = {result.run.id: result.status for result in read_all([command.output])[0]}
         for run in runs:
             print(f"{done.get(run.id, 'to do'):<9} {run.id}")
-        return 0
+        return [], []
     with place.locked():
         for folder in command.merge:
             if not (folder / "results").is_dir():
@@ -95,17 +100,26 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         if command.prepare_only:
             prepare(runs, place.scenes, place.artifacts, command.threads)
             console.print(f"{len({run.dataset for run in runs})} datasets are ready in {place.scenes}")
-            return 0
+            return [], []
         options = bench.Options(
             command.threads, command.runs_per_device, command.time_limit, command.scheduler, command.keep_models
         )
         left = bench.bench(runs, place, f"ssa {name} {command.benchmark}", options, console)
     if left:
         console.print(f"{len(left)} of {len(runs)} runs are left; call the same again to go on. First: {left[0].id}")
-    done = {result.run.id for result in read_all([command.output])[0] if result.status != "failed"}
-    failed = [run for run in runs if run not in left and run.id not in done]
+    results = {result.run.id: result for result in read_all([command.output])[0]}
+    ended = [results.get(run.id) or Result(run, "failed", "it left no result") for run in runs if run not in left]
+    return left, [result for result in ended if result.status == "failed"]
+
+
+def require_none(failed: list[Result]) -> None:
+    """Let a command end with an error where runs failed.
+
+    Raises:
+        TrainingError: there are failed runs.
+    """
     if failed:
-        console.print(
-            f"{len(failed)} of {len(runs)} runs failed; call the same again to repeat them. First: {failed[0].id}"
+        raise TrainingError(
+            f"{len(failed)} runs failed, first {failed[0].run.id}: {failed[0].reason}",
+            "see its log; call the same again to repeat them",
         )
-    return len(left) + len(failed)

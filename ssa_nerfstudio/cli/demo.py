@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
 
@@ -33,12 +34,13 @@ class Command:
             from ssa_nerfstudio.data.transforms import Transforms
 
             check_training(Transforms.read(self.data))
-        console = Console()
+        console = plain_console()
         console.print("Loading nerfstudio ...")
         from ssa_nerfstudio.experiments.demo import comparison as run
         from ssa_nerfstudio.experiments.demo import demo_report as report
 
-        columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        title = TextColumn("{task.description}", markup=False)
+        columns = (title, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console) as progress:
             tasks = {}
 
@@ -57,7 +59,7 @@ class Command:
                 demonstration = run.Demonstration([compared])
         command = f"ssa demo --steps {self.steps}"
         if self.data is not None:
-            command += f" --data {self.data} --scale-factor {self.scale_factor}"
+            command += f" --data {shlex.quote(str(self.data))} --scale-factor {self.scale_factor}"
         page = report.write_report(demonstration, self.output, command)
         for comparison in demonstration.comparisons:
             console.print(report.console_table(comparison))

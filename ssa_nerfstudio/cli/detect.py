@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
 
@@ -19,13 +21,29 @@ class Command:
     """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Default:
     outputs/detection/NAME, which is replaced."""
     json: Path | None = None
-    """File to write verdict, coverage, p_value, views and more of each camera to."""
+    """File to write verdict, coverage, p_value, views and more of each camera to; must not exist."""
     draws: int = 200
     """Number of captures of randomly shifted views to compare with, at least 200."""
     frames: int = 200
     """Number of frames to take from videos."""
     threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     """Number of photos decoded at once."""
+
+    def check(self) -> None:
+        """Check the options.
+
+        Raises:
+            InputError: one cannot be used.
+        """
+        for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
+            if (value := getattr(self, name)) < lowest:
+                raise InputError(f"--{name} must be at least {lowest}, got {value}")
+        if self.json is not None and not self.json.parent.is_dir():
+            raise InputError(f"--json {self.json}: there is no folder {self.json.parent}", "make it first")
+        if self.json is not None and (self.json.is_dir() or self.json.is_file()):
+            raise InputError(f"--json {self.json} exists already", "remove it or name another file")
+        if self.output is not None and self.output.exists():
+            raise InputError(f"{self.output} exists already", "remove it or choose another --output")
 
     def run(self) -> None:
         """Detect, print the verdict, and write evidence, masks and JSON.
@@ -35,8 +53,6 @@ class Command:
         """
         import shutil
 
-        from rich.console import Console
-
         from ssa_nerfstudio.data.writing import staged_folder, write_text
         from ssa_nerfstudio.evidence.capture_detection import (
             detect_camera,
@@ -44,19 +60,11 @@ class Command:
             read_cameras,
             write_detections,
         )
-        from ssa_nerfstudio.evidence.detection import MIN_VIEWS
+        from ssa_nerfstudio.evidence.verdict_in_words import verdict_in_words
 
-        for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
-            if (value := getattr(self, name)) < lowest:
-                raise InputError(f"--{name} must be at least {lowest}, got {value}")
-        if self.json is not None and not self.json.parent.is_dir():
-            raise InputError(f"--json {self.json}: there is no folder {self.json.parent}", "make it first")
-        if self.json is not None and self.json.is_dir():
-            raise InputError(f"--json {self.json} is a folder", "name a file")
-        if self.output is not None and self.output.exists():
-            raise InputError(f"{self.output} exists already", "remove it or choose another --output")
+        self.check()
         output = self.output or Path("outputs/detection") / self.data.resolve().stem
-        console = Console(highlight=False, soft_wrap=True)
+        console = plain_console()
         cameras = read_cameras(self.data, self.frames)
         found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
         if self.output is None:
@@ -66,15 +74,12 @@ class Command:
             if self.json is not None:
                 write_text(self.json, detections_to_json(found))
         for name, detection in found.items():
-            low, high = detection.p_interval
             camera = f"{name}: " if len(found) > 1 else ""
-            if detection.views < MIN_VIEWS:
-                console.print(f"{camera}{detection.views} views are too few to tell; {MIN_VIEWS} are needed")
-                continue
-            covered = f", {detection.coverage:.1%} of the frame" if detection.verdict != "none" else ""
-            covered = ", too few static edges to report" if detection.too_few_edges else covered
-            console.print(
-                f"{camera}{detection.verdict}{covered} ({detection.views} views, p = {detection.p_value:.3g}, "
-                f"false alarms [{low:.3f}, {high:.3f}])"
-            )
+            console.print(f"{camera}{verdict_in_words(detection)}")
         console.print(f"{output}: evidence.png, and masks whose black is the artifact")
+        wanted = any(detection.verdict != "none" for detection in found.values())
+        console.print(
+            f"Train {'with' if wanted else 'without'} an overlay: ssa run {shlex.quote(str(self.data))} --output OUT"
+        )
+        if wanted:
+            console.print("Masks for other programs: ssa export-dataset --help")

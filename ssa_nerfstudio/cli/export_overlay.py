@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
 
@@ -20,15 +21,21 @@ class Command:
     raw_frame: bool = False
     """Map everything through the lens distortion to the frame of the original photos, which masks for COLMAP and for
     nerfstudio's mask_path need. Default: the undistorted frame that nerfstudio trains in."""
+    equirectangular: bool = False
+    """Put the overlays of a 360 degree capture's faces together, in the frame of its equirectangular photos."""
+    data: Path | None = None
+    """For --equirectangular: the dataset that the run was trained on, where it has moved."""
     threshold: float = 0.5
-    """Matte above which a pixel is artifact in the masks, in (0, 1). For structure from motion 0.2 is safer."""
+    """Matte above which a pixel is artifact in the masks and in restored photos, in (0, 1). For structure from motion
+    0.2 is safer."""
     step: int | None = None
     """Checkpoint to read; the newest where not given."""
     apply: Path | None = None
     """Folder of photos, original or undistorted, at any resolution: written without the artifact to OUTPUT/photos,
-    black where the matte is above 0.95."""
+    black where the matte is above --threshold. Photos that do not show the artifact are written as they are."""
     camera: int | None = None
-    """For --apply with a rig: the camera of these photos, counted from 0 as in overlay.json."""
+    """For --apply with a rig, or where the artifact changes: the overlay of these photos, counted from 0 as in
+    overlay.json."""
 
     def run(self) -> None:
         """Read the checkpoint, write, and print what could not be recovered.
@@ -40,18 +47,26 @@ class Command:
             raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")
         if self.camera is not None and self.apply is None:
             raise InputError("--camera chooses the camera of --apply", "add --apply PHOTOS")
-        from rich.console import Console
+        if self.equirectangular and (self.raw_frame or self.camera is not None):
+            raise InputError("--equirectangular has one frame and one camera", "leave --raw-frame and --camera out")
+        if self.data is not None and not self.equirectangular:
+            raise InputError("--data is for --equirectangular", "leave it out")
         from rich.progress import track
 
         from ssa_nerfstudio.data.writing import staged_folder
         from ssa_nerfstudio.export.artifact_files import write_overlay
         from ssa_nerfstudio.export.artifact_layers import raw_layers, undistorted_layers
-        from ssa_nerfstudio.export.checkpoint import Checkpoint
+        from ssa_nerfstudio.export.checkpoint import Checkpoint, data_of_run
+        from ssa_nerfstudio.export.exposure_file import write_exposure
+        from ssa_nerfstudio.export.panorama_artifact import panorama_layers, panorama_of
         from ssa_nerfstudio.export.restoration import find_photos, restore_photos
 
         checkpoint = Checkpoint.read(self.load_config, self.step)
         undistorted = undistorted_layers(checkpoint)
-        raw = raw_layers(checkpoint) if self.raw_frame or self.apply else undistorted
+        if self.equirectangular:
+            undistorted = [panorama_layers(undistorted, panorama_of(self.data or data_of_run(self.load_config)))]
+        distorted = (self.raw_frame or self.apply) and not self.equirectangular
+        raw = raw_layers(checkpoint) if distorted else undistorted
         frames, photos = [], []
         if self.apply is not None:
             photos = find_photos(self.apply)
@@ -59,18 +74,26 @@ class Command:
             if len(raw) > 1:
                 if self.camera is None or not 0 <= self.camera < len(raw):
                     raise InputError(
-                        f"the run has {len(raw)} cameras",
-                        f"choose the camera of these photos: --camera 0 to {len(raw) - 1}",
+                        f"the run has {len(raw)} overlays: {', '.join(layers.name for layers in raw)}",
+                        f"choose that of these photos: --camera 0 to {len(raw) - 1}; where the artifact changes, "
+                        "ssa export-dataset --photos cleaned chooses each photo's own",
                     )
                 frames = [raw[self.camera], undistorted[self.camera]]
-        console = Console(highlight=False, soft_wrap=True)
+        console = plain_console()
         with staged_folder(self.output) as folder:
             written = write_overlay(folder, checkpoint, raw if self.raw_frame else undistorted, self.threshold)
-            photos_done = restore_photos(self.apply or folder, photos, frames, folder)
-            recovered = list(track(photos_done, "Photos", total=len(photos), console=console, transient=True))
-        for number, camera in enumerate(written["cameras"]):
+            write_exposure(checkpoint, folder)
+            photos_done = restore_photos(self.apply or folder, photos, frames, folder, self.threshold)
+            written_photos = list(track(photos_done, "Photos", total=len(photos), console=console, transient=True))
+            recovered = [photo for photo in written_photos if photo.shows]
+            if photos and not recovered:
+                raise InputError(
+                    f"none of the {len(photos)} photos in {self.apply} shows the artifact where it was learned",
+                    "choose photos of the camera that the run was trained on, before anything was removed from them",
+                )
+        for camera in written["cameras"]:
             console.print(
-                f"{self.output / camera['folder']}: camera {number}, {camera['frame']} frame, "
+                f"{self.output / camera['folder']}: {camera['name']}, {camera['frame']} frame, "
                 f"{camera['covered_fraction']:.1%} with a matte above {self.threshold:g}, mean matte "
                 f"{camera['mean_matte']:.3f}"
             )
@@ -79,9 +102,15 @@ class Command:
             implausible = max(recovered, key=lambda r: r.implausible)
             console.print(
                 f"{self.output / 'photos'}: {len(recovered)} photos; {hidden:.1%} of their pixels lie behind a matte "
-                f"above 0.95 and could not be recovered (black). Where the artifact is estimated wrongly, pixels leave "
-                f"the range of colors: at most {implausible.implausible:.1%} of a photo ({implausible.path})."
+                f"above {self.threshold:g} or at its edge and could not be recovered (black). Where the artifact is "
+                f"estimated wrongly, pixels leave the range of colors: at most {implausible.implausible:.1%} of a "
+                f"photo ({implausible.path})."
             )
+            if unchanged := [str(photo.path) for photo in written_photos if not photo.shows]:
+                console.print(
+                    f"{len(unchanged)} more photos do not show the artifact where it was learned, and were written as "
+                    f"they are: {', '.join(unchanged[:3])}{', ...' if len(unchanged) > 3 else ''}."
+                )
             if clipped := sum(r.clipped for r in recovered) / len(recovered):
                 console.print(
                     f"The artifact adds light, and {clipped:.1%} of the pixels are white by it: there the scene is at "

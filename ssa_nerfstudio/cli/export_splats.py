@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
 
@@ -41,14 +43,20 @@ class Command:
         box = self.obb_center, self.obb_rotation, self.obb_scale
         if any(box) and not all(box):
             raise InputError("a box needs all of --obb-center, --obb-rotation and --obb-scale")
+        for name in ("obb_center", "obb_rotation", "obb_scale"):
+            values = getattr(self, name) or ()
+            if not all(map(math.isfinite, values)):
+                raise InputError(f"--{name.replace('_', '-')} must be finite, got {values}")
+        if min(self.obb_scale or (1,)) <= 0:
+            raise InputError(f"--obb-scale must be positive, got {self.obb_scale}")
         if Path(self.output_filename).name != self.output_filename or not self.output_filename.endswith(".ply"):
             raise InputError(
                 f"--output-filename {self.output_filename} must be the name of a .ply file, without folders"
             )
-        from rich.console import Console
 
         from ssa_nerfstudio.data.writing import unwritable_as_input_error
         from ssa_nerfstudio.export.checkpoint import Checkpoint
+        from ssa_nerfstudio.export.exposure_file import write_exposure
         from ssa_nerfstudio.export.splats import select, within, write_compressed_ply, write_ply
 
         checkpoint = Checkpoint.read(self.load_config, self.step)
@@ -56,9 +64,9 @@ class Command:
         inside = within(gaussians, *box) if all(box) else None  # pyright: ignore[reportArgumentType]
         selection = select(gaussians, inside)
         path = self.output_dir / self.output_filename
-        console = Console(highlight=False, soft_wrap=True)
+        console = plain_console()
         with unwritable_as_input_error(path):
-            self.output_dir.mkdir(parents=True, exist_ok=True)
+            exposure = write_exposure(checkpoint, self.output_dir)
             write_ply(path, gaussians, selection.kept, self.ply_color_mode)
             paths = [path]
             if self.compressed:
@@ -66,6 +74,8 @@ class Command:
                 write_compressed_ply(paths[1], gaussians, selection.kept)
         for written in paths:
             console.print(f"{written}: {selection.kept.sum():,} Gaussians, {written.stat().st_size / 1e6:,.1f} MB")
+        if exposure is not None:
+            console.print(f"{exposure}: each photo's gain and offset; the splats are at the mean exposure")
         if selection.not_finite or selection.too_faint:
             console.print(
                 f"Left out: {selection.too_faint:,} below an opacity of 1/255, {selection.not_finite:,} not finite."

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
+import shlex
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.data.sources import Source
+    from ssa_nerfstudio.sfm.photos_to_dataset import Summary
 
 
 @dataclass
@@ -18,11 +26,15 @@ class Command:
     """
 
     train: Path
-    """Photos (JPEG, PNG, HEIC with pillow-heif) or videos of one camera in one orientation: a folder, or one video."""
+    """Photos (JPEG, PNG, HEIC with pillow-heif) or videos: a folder, one video, or a folder of a rig with a subfolder
+    for each camera."""
     output: Path
     """Dataset to write; must not exist."""
     clean: Path | None = None
     """Folder or video of the same scene without the artifact, to evaluate on."""
+    colmap: Path | None = None
+    """A model that COLMAP has made of the photos of --train (.bin or .txt), to be repaired: poses that hold off the
+    artifact are kept, and the other photos are registered to them. Implies --detect, where --mask is not given."""
     mask: Path | None = None
     """Mask of the artifact in the photos of --train, of the raw frame's shape: black is ignored, all else used, as by
     COLMAP and nerfstudio. Used for poses alone; training uses whole photos."""
@@ -35,6 +47,12 @@ class Command:
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighborhood."""
     min_registered: float = 0.5
     """Stop when less than this share of a pass's photos is registered."""
+    projection: Literal["auto", "perspective", "fisheye", "equirectangular"] = "auto"
+    """What the photos are. fisheye gets lenses of OPENCV_FISHEYE, which training undistorts. Equirectangular (360
+    degrees, 2:1) photos are cut into six perspective faces. auto takes 2:1 photos for such whose left edge continues
+    the right one, and all others for perspective."""
+    leave_out: tuple[Literal["front", "right", "back", "left", "up", "down"], ...] = ()
+    """Faces of equirectangular photos to leave out, for example down, where only the operator or a tripod is seen."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """All pairs of photos, or neighbors in time and pairs of keyframes; auto: all pairs up to 150 photos."""
     flatten: bool = True
@@ -47,15 +65,18 @@ class Command:
     threads: int = -1
     """Number of threads; -1: one per core."""
 
-    def run(self) -> None:
-        """Process, and print what was registered and what to do next.
+    def prepared(self) -> tuple[list[Source], Callable[..., Summary]]:
+        """Check the options and find the photos.
+
+        Returns:
+            The cameras to train on, and the work: `photos_to_dataset.process`, which only lacks `on_progress`.
 
         Raises:
-            InputError: an option or a file cannot be used, or too few photos were registered.
+            InputError: an option or a file cannot be used.
         """
-        from rich.console import Console
-
-        from ssa_nerfstudio.data.sources import read_source
+        from ssa_nerfstudio.data.equirectangular import with_faces
+        from ssa_nerfstudio.data.sources import read_source, read_sources
+        from ssa_nerfstudio.sfm.existing_model import read_existing_model
         from ssa_nerfstudio.sfm.feature_mask import read_mask
         from ssa_nerfstudio.sfm.photos_to_dataset import process
         from ssa_nerfstudio.sfm.reconstruction import SfmSettings
@@ -67,22 +88,60 @@ class Command:
             raise InputError(f"--min-registered is a share of the photos, from 0 to 1, got {self.min_registered}")
         if self.threads < 1 and self.threads != -1:
             raise InputError(f"--threads must be at least 1, or -1 for one a core, got {self.threads}")
+        two = self.clean is not None
+        sources = read_sources(self.train, "train" if two else "frame", min_photos=3)
+        clean = None if self.clean is None else read_source(self.clean, "clean", min_photos=1)
+        if clean is not None and clean.name in {source.name for source in sources}:
+            raise InputError(f"{self.train} has a camera called {clean.name}, as --clean", "rename its folder")
+        known = None
+        if self.colmap is not None:
+            if self.projection not in ("auto", "perspective") or self.leave_out:
+                raise InputError("--colmap takes models of perspective photos", "leave it out, or the faces' options")
+            known = read_existing_model(self.colmap, self.train, sources)
+            sources = list(known.sources)
+        else:
+            sources = with_faces(sources, self.projection, self.leave_out)
+        if clean is not None and known is None:
+            (clean,) = with_faces([clean], self.projection, self.leave_out)
+        first = sources[0]
+        if self.mask is not None and len(sources) > 1:
+            raise InputError(
+                f"{self.train} holds the photos of {len(sources)} cameras, --mask is one camera's",
+                "use --detect, or process the cameras one by one",
+            )
+        mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
+        model = "OPENCV_FISHEYE" if self.projection == "fisheye" else "OPENCV"
+        settings = SfmSettings(
+            self.matching, self.max_image_size, self.flatten, self.filter_stationary, model, self.threads
+        )
+        detect = self.detect or known is not None
+        return sources, partial(
+            process, sources, self.output, mask, detect, clean, self.frames, self.min_registered, settings, known
+        )
+
+    def run(self) -> None:
+        """Process, and print what was registered and what to do next.
+
+        Raises:
+            InputError: an option or a file cannot be used, or too few photos were registered.
+        """
+        from ssa_nerfstudio.data.equirectangular import cut_into_faces
+        from ssa_nerfstudio.sfm.progress_display import progress_display
+
         if self.output.exists():
             raise InputError(f"{self.output} exists already", "remove it or choose another --output")
-        two = self.clean is not None
-        sources = [read_source(self.train, "train" if two else "frame", min_photos=3)]
-        if self.clean is not None:
-            sources.append(read_source(self.clean, "clean", min_photos=1))
-        first = sources[0]
-        mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
-        settings = SfmSettings(self.matching, self.max_image_size, self.flatten, self.filter_stationary, self.threads)
-        console = Console(highlight=False, soft_wrap=True)
+        sources, process = self.prepared()
+        console = plain_console()
         for source in sources:
+            if source.faces:
+                console.print(cut_into_faces(source))
             if source.skipped_videos:
                 console.print(f"{source.path}: {len(source.skipped_videos)} videos beside the photos are left out")
+        with progress_display(console) as on_progress:
+            summary = process(on_progress=on_progress)
 
-        summary = process(sources, self.output, mask, self.detect, self.frames, self.min_registered, settings, console)
-
+        if summary.repair is not None:
+            console.print(f"{self.colmap}: {summary.repair.in_words()}")
         for each in summary.passes:
             missing = ", ".join([*each.missing[:5], *["..."][: len(each.missing) > 5]])
             left_out = f"; not: {missing}" if missing else ""
@@ -92,4 +151,4 @@ class Command:
         if summary.masked:
             console.print(f"{summary.masked:.0%} of the frame was masked")
         console.print(f"{summary.points} points, mean reprojection error {summary.reprojection_error:.2f} pixels")
-        console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}")
+        console.print(f"Train on it: ns-train ssa-splatfacto --data {shlex.quote(str(self.output))}")

@@ -24,15 +24,15 @@ class Command:
         Raises:
             InputError: there are no results.
         """
-        from rich.console import Console
 
+        from ssa_nerfstudio._system.terminal_messages import plain_console
         from ssa_nerfstudio.errors import InputError
         from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import report
 
         if not self.folders:
             raise InputError("name the --output folder of ssa bench: ssa report DIR")
         files, problems = report([*self.folders], self.output or self.folders[0] / "report")
-        console = Console(highlight=False, soft_wrap=True)
+        console = plain_console()
         for problem in problems:
             console.print(f"ignored: {problem}", style="yellow")
         for file in files:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
 
@@ -25,6 +27,9 @@ class Command:
     """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats its effects."""
     seed: int | None = None
     """Decides everything random, not negative; by default the scene's own, or 0."""
+    exposure: float | None = None
+    """Each training photo gets a gain and an offset of its own: standard deviation of the gains' logarithm, in [0, 1];
+    by default the scene's own, or 0. It acts on what is on the lens, and not on what software drew (watermark, ui)."""
     eval_interval: int = 8
     """One photo in so many, in sorted order, is for testing; ignored where transforms.json has a split."""
     downscale_factor: int = 1
@@ -38,10 +43,9 @@ class Command:
         Raises:
             InputError: the arguments, the dataset or a configuration cannot be used.
         """
-        from rich.console import Console
 
         from ssa_nerfstudio.data.dataset import Dataset
-        from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects, read_scene
+        from ssa_nerfstudio.experiments.simulation.scene import MAX_EXPOSURE, Scene, read_effects, read_scene
         from ssa_nerfstudio.experiments.simulation.simulator import simulate
 
         if (self.effects is None) == (self.scene is None):
@@ -52,10 +56,14 @@ class Command:
         scene = Scene(read_effects(self.effects)) if self.effects is not None else read_scene(str(self.scene))
         if self.seed is not None:
             scene = dataclasses.replace(scene, seed=self.seed)
+        if self.exposure is not None:
+            if not 0 <= self.exposure <= MAX_EXPOSURE:
+                raise InputError(f"--exposure must be in [0, {MAX_EXPOSURE}], got {self.exposure}")
+            scene = dataclasses.replace(scene, exposure=self.exposure)
         dataset = Dataset.read(self.data, self.eval_interval, self.downscale_factor)
         simulate(dataset, scene, self.output, self.threads)
 
         train, _, test = dataset.split
-        console = Console(highlight=False, soft_wrap=True)
+        console = plain_console()
         console.print(f"{self.output}: {len(train)} training photos, {len(test)} clean test photos")
-        console.print(f"Train on it: ns-train ssa-splatfacto --data {self.output}")
+        console.print(f"Train on it: ns-train ssa-splatfacto --data {shlex.quote(str(self.output))}")

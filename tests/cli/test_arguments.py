@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import re
 import sys
 import typing
 from pathlib import Path
@@ -18,13 +19,23 @@ def command_of(name: str) -> type:
     return importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
 
 
+def flag_of(field: dataclasses.Field) -> str:
+    """How an option is called: as its field, unless that says another name."""
+    named = re.search(r'arg\(name=[\'"](\w+)', str(field.type))
+    return "--" + (named[1] if named else field.name.replace("_", "-"))
+
+
 def typed(name: str) -> dict[str, object]:
-    """Flags and types of a command's options, None and Positional left out."""
+    """Flags and types of a command's options, None, Positional and what no one types left out."""
     found = {}
-    for field, hint in typing.get_type_hints(command_of(name)).items():
+    annotated = typing.get_type_hints(command_of(name), include_extras=True)
+    hints = typing.get_type_hints(command_of(name))
+    fields = {field.name: field for field in dataclasses.fields(command_of(name))}
+    for field in [field for field in hints if "Suppress" not in str(annotated[field])]:
+        hint = hints[field]
         members = [member for member in typing.get_args(hint) if member is not type(None)]
         optional = type(None) in typing.get_args(hint)
-        found["--" + field.replace("_", "-")] = members[0] if optional else hint
+        found[flag_of(fields[field])] = members[0] if optional else hint
     return found
 
 
@@ -33,7 +44,10 @@ def required(name: str) -> list[str]:
     words = []
     for field in dataclasses.fields(command_of(name)):
         if field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            words += ["--" + field.name.replace("_", "-"), "somewhere"]
+            positional = "tyro.conf.Positional" in str(field.type)
+            choices = re.search(r'Literal\[[\'"](\w+)', str(field.type))
+            words += [] if positional else [flag_of(field)]
+            words.append(choices[1] if choices else "somewhere")
     return words
 
 
@@ -63,11 +77,17 @@ def test_a_misspelt_option(name, capsys):
     assert f"Unrecognized options: {flag[:-1]}, 1; Perhaps you meant: {flag}" in line
 
 
-@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"demo", "report"}))
+@pytest.mark.parametrize("name", sorted(set(COMMANDS) - {"demo", "report", "run"}))
 def test_required_options_that_are_missing(name, capsys):
     line = said([name], capsys)
     assert f"Missing from ssa {name}: {required(name)[0]} PATH" in line
     assert all(flag in line for flag in required(name)[::2])
+
+
+def test_photos_and_output_of_a_run_are_required(capsys):
+    line = said(["run"], capsys)
+    assert "PHOTOS" in line
+    assert "--output" in line
 
 
 def test_the_folders_of_a_report_are_required(capsys):

@@ -1,0 +1,93 @@
+"""`ssa export-dataset`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.errors import InputError
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.data.dataset import Dataset
+    from ssa_nerfstudio.export.capture_artifact import CaptureArtifact
+
+
+@dataclass
+class Command:
+    """Write a capture for another program: photos, masks of the artifact, poses, and a README with its command."""
+
+    output: Path
+    """Folder to write; must not exist."""
+    program: Annotated[
+        Literal["nerfstudio", "colmap", "lichtfeld", "brush", "3dgrut", "postshot"], tyro.conf.arg(name="for")
+    ]
+    """Who is to read it: names, folders and polarity of masks are that program's."""
+    load_config: Path | None = None
+    """The config.yml of a run, whose overlay is the mask. Without it the artifact is detected, which takes --data."""
+    data: Path | None = None
+    """The nerfstudio dataset; of a run its own where not given."""
+    photos: Literal["original", "cleaned"] = "original"
+    """Photos as they are, or without the artifact (needs --load-config)."""
+    masks: Literal["auto", "artifact", "holes", "none"] = "auto"
+    """What is masked: artifact: all that it changes; holes: what cleaned photos could not recover; auto: artifact for
+    original photos, holes for cleaned ones."""
+    frame: Literal["auto", "raw", "undistorted"] = "auto"
+    """Photos with or without the lens' distortion; auto: what the program takes best."""
+    threshold: float = 0.5
+    """Matte above which a pixel is artifact, in (0, 1)."""
+    downscale_factor: int = 1
+    """N > 1 reads images_N."""
+
+    def run(self) -> None:
+        """Read run and dataset, write, and print what is left.
+
+        Raises:
+            InputError: an option, the checkpoint or a photo cannot be used.
+        """
+        if not 0 < self.threshold < 1:
+            raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")
+        if self.load_config is None and self.data is None:
+            raise InputError("there is nothing to export", "give --load-config of a run, or --data of a dataset")
+        if self.output.exists():
+            raise InputError(f"{self.output} exists already", "remove it or choose another --output")
+        from rich.progress import track
+
+        from ssa_nerfstudio.data.dataset import Dataset
+        from ssa_nerfstudio.data.writing import staged_folder
+        from ssa_nerfstudio.export.checkpoint import data_of_run
+        from ssa_nerfstudio.export.dataset_export import DatasetExport
+
+        console = plain_console()
+        data = self.data or data_of_run(self.load_config)  # pyright: ignore[reportArgumentType]
+        dataset = Dataset.read(data, eval_interval=8, downscale_factor=self.downscale_factor)
+        artifact = self._artifact(dataset, data)
+        export = DatasetExport(dataset, artifact, self.program, self.photos, self.masks, self.frame)
+        with staged_folder(self.output) as folder:
+            shown = track(
+                export.write_photos(folder), "Photos", total=len(export.views), console=console, transient=True
+            )
+            photos = list(shown)
+            export.write_poses(folder, photos)
+        left = sum(photo.left for photo in photos) / len(photos)
+        console.print(
+            f"{self.output}: {len(photos)} photos for {export.preset.title}, {export.frame} frame; {left:.1%} of their "
+            f"pixels are left, of the least {min(photo.left for photo in photos):.1%}"
+        )
+        console.print(f"There: {export.preset.start}")
+
+    def _artifact(self, dataset: Dataset, data: Path) -> CaptureArtifact:
+        """The artifact of the run, else as detected."""
+        from ssa_nerfstudio.evidence.capture_detection import detect_artifacts
+        from ssa_nerfstudio.export.capture_artifact import DetectedArtifact, LearnedArtifact
+        from ssa_nerfstudio.export.checkpoint import Checkpoint
+
+        if self.load_config is not None:
+            return LearnedArtifact(Checkpoint.read(self.load_config), self.threshold)
+        if self.downscale_factor != 1 or self.photos == "cleaned":
+            raise InputError("this takes the overlay of a run", "add --load-config")
+        lenses = [view.lens for view in dataset.views if view.role == "train"]
+        return DetectedArtifact(lenses, list(detect_artifacts(data).values()))

@@ -1,0 +1,160 @@
+"""No odd input ends in a traceback: one line that names the culprit and exit code 2, or it is worked with."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from experiments.benchmark.made_results import all_results, folder_of
+from export.small_checkpoints import one_camera, write_run
+from odd_cases import corpus, edit_checkpoint, edit_json, edit_photo
+
+from ssa_nerfstudio._system.terminal_messages import print_error
+from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.errors import SSAError
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+
+
+def called(*words: object) -> int:
+    """Exit code of `ssa ...` in this process; anything but an exit is a traceback, and fails the test."""
+    try:
+        main([str(word) for word in words])
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else 0
+    return 0
+
+
+@pytest.fixture
+def readers(tmp_path, configure_training):
+    def train(data: Path) -> int:
+        model = {"overlay": "on", "overlay_start": "constant"}
+        config = configure_training("ssa-splatfacto", data, tmp_path / "runs", 2, model)
+        config.set_timestamp()
+        try:
+            config.setup(local_rank=0, world_size=1).setup()
+        except SSAError as error:  # as plugin/command_entry.py does it for ns-train
+            return print_error(error)
+        return 0
+
+    out = tmp_path / "out"
+    return {
+        "detect": lambda data: called("detect", "--data", data, "--output", out, "--threads", 1),
+        "simulate": lambda data: called(
+            "simulate", "--data", data, "--output", out, "--effects", "vignette", "--threads", 1
+        ),
+        "train": train,
+    }
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """Hash of every file, by path."""
+    return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
+
+
+READERS = ("detect", "simulate", "train")
+
+
+@pytest.mark.parametrize("reader", READERS)
+@pytest.mark.parametrize("case", corpus("transforms"), ids=lambda case: case["case"])
+def test_an_odd_transforms_json(case, reader, readers, broken_scene, tmp_path, capsys):
+    edit_json(broken_scene / "transforms.json", case)
+    code = readers[reader](broken_scene)
+    judge(case, reader, code, capsys.readouterr().err, tmp_path)
+
+
+EXPORTS = {
+    "export-overlay": ["--output"],
+    "export-splats": ["--compressed", "--output-dir"],
+}
+
+
+@pytest.mark.parametrize("command", EXPORTS)
+@pytest.mark.parametrize("case", corpus("checkpoints"), ids=lambda case: case["case"])
+def test_an_odd_checkpoint(case, command, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    config = write_run(tmp_path / "run", one_camera(ScreenSpaceOverlay(20, 30)))
+    edit_checkpoint(tmp_path / "run/nerfstudio_models/step-000000009.ckpt", case)
+    code = called(command, "--load-config", config, *EXPORTS[command], tmp_path / "out")
+    judge(case, command, code, capsys.readouterr().err, tmp_path)
+    assert not Path("hostile-code-ran").exists()
+
+
+PHOTO_READERS = (*READERS, "detect photos", "process", "export-overlay")
+
+
+@pytest.mark.parametrize("reader", PHOTO_READERS)
+@pytest.mark.parametrize("case", corpus("photos"), ids=lambda case: case["case"])
+def test_an_odd_photo(case, reader, readers, broken_scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for path in (broken_scene / "images").glob("test_*"):
+        path.rename(broken_scene / path.name)
+    edit_json(broken_scene / "transforms.json", {"unsplit": True})
+    content = json.loads((broken_scene / "transforms.json").read_text())
+    content["frames"] = [frame for frame in content["frames"] if "train" in frame["file_path"]]
+    (broken_scene / "transforms.json").write_text(json.dumps(content))
+    edit_photo(broken_scene / "images/train_0003.png", case)
+    photos, out = broken_scene / "images", tmp_path / "out"
+    if reader == "detect photos":
+        code = called("detect", "--data", photos, "--output", out, "--threads", 1)
+    elif reader == "process":
+        code = called("process", "--train", photos, "--output", out, "--threads", 1)
+        if "says" not in case or reader in case.get("taken_by", ()):
+            case = {"says": "photos could be registered"}  # these are too small
+    elif reader == "export-overlay":
+        config = write_run(tmp_path / "run", one_camera(ScreenSpaceOverlay(48, 64)))
+        code = called("export-overlay", "--load-config", config, "--output", out, "--apply", photos)
+    else:
+        code = readers[reader](broken_scene)
+    judge(case, reader, code, capsys.readouterr().err, tmp_path)
+    assert not Path("hostile-code-ran").exists()
+
+
+@pytest.fixture(scope="session")
+def inputs(tiny_scene, tmp_path_factory) -> dict[str, str]:
+    """What the calls name. Read only."""
+    folder = tmp_path_factory.mktemp("inputs")
+    (folder / "text.txt").write_text("text")
+    runs = [each for each in all_results() if each.run.scene == "attic" and each.run.seed == 0]
+    return {
+        "scene": str(shutil.copytree(tiny_scene, folder / "scene")),
+        "photos": str(folder / "scene/images"),
+        "config": str(write_run(folder / "run", one_camera(ScreenSpaceOverlay(48, 64)))),
+        "results": str(folder_of(folder / "results", runs)),
+        "file": str(folder / "text.txt"),
+        "long": "a" * 5000,
+        "digits": "9" * 5000,
+        "space": "my photos",
+    }
+
+
+@pytest.mark.parametrize("case", corpus("calls"), ids=lambda case: case["call"])
+def test_an_odd_call(case, inputs, tmp_path, monkeypatch, capsys):
+    folder = tmp_path / "here"
+    for name, text in {"there.txt": "", **case.get("files", {})}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+    monkeypatch.chdir(folder)
+    before = contents(Path(inputs["file"]).parent)
+    there = {path.name for path in folder.iterdir()}
+    code = called(*(word.format(**inputs) for word in shlex.split(case["call"])))
+    out, err = capsys.readouterr()
+    judge(case, "", code, err, tmp_path)
+    assert case.get("prints", "") in out
+    assert {path.name for path in folder.iterdir()} - there == {*case.get("after", [])}
+    assert contents(Path(inputs["file"]).parent) == before
+
+
+def judge(case, reader, code, err, tmp_path):
+    refused = "says" in case and reader not in case.get("taken_by", ())
+    lines = [line for line in err.splitlines() if line.startswith("ssa-nerfstudio: error")]
+    if refused:
+        assert code == 2, "was taken"
+        assert len(lines) == 1, err
+        assert case["says"] in lines[0]
+        assert not (tmp_path / "out").exists()
+    else:
+        assert (code, lines) == (0, [])
