@@ -12,34 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-import torch
 import torch.nn.functional as F
-from PIL import Image
 
-from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
 from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
 from ssa_nerfstudio.metrics.matte import matte_iou
 
 MASK = "artifact_mask_approx.png"
 """Name of the mask in the dataset."""
-
-
-def undistorted_mask(data: Path, size: tuple[int, int]) -> torch.Tensor:
-    """Read the mask of the artifact in the undistorted frame, [H, W] bool, at the training's resolution.
-
-    Args:
-        data: dataset that holds `MASK`, with one camera.
-        size: height and width of the undistorted frame as it is trained on.
-    """
-    lens = Dataset.read(data, eval_interval=8).views[0].lens
-    raw = np.asarray(Image.open(data / MASK).convert("L"), np.float32) / 255
-    straight = undistort(np.repeat(raw[..., None], 3, axis=2), lens)[..., 0]
-    return F.interpolate(torch.from_numpy(straight)[None, None], size=size, mode="area")[0, 0] > 0.5
 
 
 @dataclass
@@ -65,6 +49,7 @@ class Command:
         """
         if not (self.data / MASK).is_file():
             raise InputError(f"{self.data / MASK} does not exist", "name a dataset with a mask of its artifact")
+        region = ArtifactRegion.read(self.data / MASK, Dataset.read(self.data, eval_interval=8).views[0].lens)
         model = model_settings(self.settings)
         with tempfile.TemporaryDirectory() as scratch:
             config = configure(self.method, self.data, Path(scratch), self.steps, model, self.scale_factor)
@@ -72,11 +57,9 @@ class Command:
         row = [f"{self.method} {' '.join(self.settings)}".strip(), f"PSNR {outcome.metrics['psnr']:.2f}"]
         for overlay in pipeline.model.artifacts.learned():
             matte = overlay.matte().detach().cpu()[..., 0]
-            mask = undistorted_mask(self.data, (len(matte), matte.shape[1]))
-            third = len(matte) // 3
-            rest = matte[third:][~mask[third:]]
-            row += [f"IoU {matte_iou(matte, mask):.3f}", f"upper third {matte[:third].mean():.3f}"]
-            row += [f"artifact {matte[mask].mean():.3f}", f"rest {rest.mean():.3f}"]
+            mask = F.interpolate(region.inside.float()[None, None], size=matte.shape, mode="area")[0, 0] > 0.5
+            row.append(f"IoU {matte_iou(matte, mask):.3f}")
+            row += [f"{name.replace('_', ' ')} {value:.3f}" for name, value in region.mattes(matte).items()]
         print("; ".join(row))
 
 

@@ -35,8 +35,9 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 def _command(name: str) -> str:
     command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
     rows = [
-        (field.name.upper() if _positional(field) else _option(field.name), field, text)
+        (field.name.upper() if _positional(field) else _option(_name(field)), field, text)
         for field, text in _fields(command)
+        if "tyro.conf.Suppress" not in str(field.type)
     ]
     return f"## `ssa {name}`\n\n{COMMANDS[name]}\n\n{_table(rows)}"
 
@@ -46,6 +47,12 @@ def _configuration(heading: str) -> str:
     config = getattr(importlib.import_module(module), name)
     rows = [(_option(field.name, prefix), field, text) for field, text in _fields(config)]
     return f"## {heading}\n\n{_table(rows)}"
+
+
+def _name(field: dataclasses.Field) -> str:
+    """The name of an argument, which an annotation may give it because it is a word of Python."""
+    named = re.search(r'tyro\.conf\.arg\(name=[\'"](\w+)', str(field.type))
+    return named[1] if named else field.name
 
 
 def _option(name: str, prefix: str = "--") -> str:
