@@ -7,7 +7,7 @@ setup(
     packages=[*find_packages(include=["ssa_nerfstudio*"]), *configs],
     package_dir={"ssa_nerfstudio.configs": "configs"},
     package_data={
-        "ssa_nerfstudio.experiments": ["templates/*"],
+        **{name: ["templates/*"] for name in ("ssa_nerfstudio.experiments", "ssa_nerfstudio.workflow")},
         **{name: ["*.yaml"] for name in configs},
     },
 )

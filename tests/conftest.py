@@ -116,6 +116,14 @@ def photos() -> Callable[[int], list[np.ndarray]]:
 
 
 @pytest.fixture(scope="session")
+def trace_built_in_scene() -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+    """From the experiments: rays in the built-in scene, for cameras of any kind (`wide_captures`)."""
+    from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+
+    return DemoScene().trace
+
+
+@pytest.fixture(scope="session")
 def tiny_scene(tmp_path_factory: pytest.TempPathFactory, write_built_in_scene, draw_effect) -> Path:
     """A dataset of 12 training views of 64 x 48 pixels behind a dashboard, and 3 clean test views. Read only."""
     folder = tmp_path_factory.mktemp("scene") / "dashboard"

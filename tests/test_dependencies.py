@@ -23,6 +23,7 @@ OPTIONAL = {
     "pillow_heif": "the extra heic",
     "pydantic_core": "comes with pydantic",
     "markupsafe": "comes with jinja2",
+    "diffusers": "the extra diffusion",
 }
 
 

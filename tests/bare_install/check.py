@@ -54,7 +54,7 @@ def check_startup() -> None:
     """Help answers quickly."""
     plain, usage = seconds("python", "-c", "pass"), seconds("ssa", "--help")
     assert usage < MAX_STARTUP_RATIO * plain, f"ssa --help takes {usage:.3f} s, python -c pass {plain:.3f} s"
-    for command in ("detect", "process", "export-overlay", "export-splats", *EXPERIMENTS):
+    for command in ("run", "detect", "process", "export-dataset", "export-overlay", "export-splats", *EXPERIMENTS):
         taken = seconds("ssa", command, "--help")
         assert taken < MAX_HELP_SECONDS, f"ssa {command} --help takes {taken:.2f} s"
     loaded = run("python", "-c", "import sys, ssa_nerfstudio; print('torch' in sys.modules)")
@@ -82,6 +82,10 @@ def check_product(capture: Path, scratch: Path) -> None:
     )
     assert (scratch / "artifact/overlay.png").is_file()
     run("ns-eval", "--load-config", config, "--output-path", scratch / "metrics.json")
+    out = scratch / "out"
+    run("ssa", "run", capture, "--output", out, "--steps", "20", "--train.pipeline.model.num-downscales", "0")
+    assert (out / "report.html").is_file()
+    run("ssa", "export-dataset", "--for", "colmap", "--load-config", config, "--output", scratch / "masked")
     refused = run("ssa", "process", "--train", capture / "images", "--output", scratch / "processed", code=2)
     assert "could be registered" in refused, "twelve views of 160 pixels are too few for structure from motion"
 

@@ -8,7 +8,9 @@ from hard_cases import Case, Family
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.detection import detect
-from ssa_nerfstudio.evidence.initialization import initialize
+from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize, initialize_from
+from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
+from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
@@ -189,7 +191,7 @@ def _mixed(stranger: Tensor) -> None:
         raise AssertionError("it was taken")
 
 
-@STATISTICS.case("almost everything static", "The 70th percentile of sigma is 0, and evidence is divided by it.")
+@STATISTICS.case("almost everything static", "A matte of 1 nearly everywhere, with a weight of 0 in the sparsity loss.")
 def _() -> None:
     images = np.repeat(photos(1), 20, axis=0)
     images[:, 0, 0] = photos(20)[:, 0, 0]
@@ -209,6 +211,79 @@ def _detected(images: np.ndarray) -> None:
     numbers = {name: value for name, value in vars(found).items() if isinstance(value, float)}
     assert numbers
     assert all(np.isfinite(value) for value in numbers.values()), numbers
+
+
+def estimated(points: Tensor, images: np.ndarray, masks: list | None = None) -> LayerEstimate:
+    """Estimate layers from points in front of a camera that looks along z in every view; and start an overlay."""
+    K = torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 3.0], [0.0, 0.0, 1.0]])
+    torn = [None if mask is None else torch.from_numpy(mask) for mask in masks or [None] * len(images)]
+    views = [View(torch.from_numpy(image), mask, torch.eye(4), K) for image, mask in zip(images, torn, strict=True)]
+    statistics = stream(images, masks)
+    found = estimate(sample_points(points, views), guide_of(statistics), torch.zeros(statistics.size, dtype=torch.bool))
+    for layer in (found.transmittance, found.addition):
+        assert torch.isfinite(layer).all()
+        assert 0 <= layer.min() <= layer.max() <= 1
+    for light in (False, True):
+        overlay = ScreenSpaceOverlay(*statistics.size, adds_light=light)
+        initialize_from(overlay, found, guide_of(statistics))
+        assert all(torch.isfinite(parameter).all() for parameter in overlay.parameters())
+    assert 0 <= found.share() <= 1
+    assert found.adds_light() in (False, True)
+    return found
+
+
+def scattered(count: int = 40) -> Tensor:
+    """Points in the frame, at depths of 1 to 3."""
+    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    points[:, 2] = 2 + 2 * points[:, 2]
+    return points
+
+
+@STATISTICS.case("points in photos of one color", "Colors without variance: a regression over 0 / 0.")
+def _() -> None:
+    found = estimated(scattered(), np.full((5, *SIZE), 130, np.uint8))
+    assert found.transmittance.max() < 0.1, "what varies nowhere shows no scene"
+
+
+@STATISTICS.case("a single point", "Every pixel but one is without a sample.")
+def _() -> None:
+    found = estimated(torch.tensor([[0.0, 0.0, 2.0]]), photos(6))
+    assert found.transmittance.min() > 0.9
+
+
+@STATISTICS.case("many points at one pixel", "A pixel's block of equations is singular within rounding.")
+def _() -> None:
+    estimated(torch.tensor([[0.0, 0.0, 2.0]]).repeat(20_000, 1), photos(6))
+
+
+@STATISTICS.case("points seen once", "A point of one sample vouches for itself: its color is the photo.")
+def _() -> None:
+    found = estimated(scattered(), photos(1))
+    assert found.transmittance.min() > 0.9
+
+
+@STATISTICS.case("points at the camera and at infinity", "Depths of 0, 1e30 and infinity divide and overflow.")
+def _() -> None:
+    odd = torch.tensor([[0.0, 0.0, 0.0], [1e30, 0.0, 1e30], [torch.inf, 0.0, 1.0], [0.0, torch.nan, 1.0], [0, 0, -1.0]])
+    estimated(torch.cat([odd, scattered()]), photos(6))
+
+
+@STATISTICS.case("points behind masks that leave one view", "Samples of pixels that are seen once.")
+def _() -> None:
+    masks = [np.full(SIZE[:2], view == 0) for view in range(5)]
+    estimated(scattered(), photos(5), masks)
+
+
+@STATISTICS.case("points in black and white photos", "Layers at the ends of the range, whose logits are infinite.")
+def _() -> None:
+    images = np.zeros((6, *SIZE), np.uint8)
+    images[3:] = 255
+    estimated(scattered(), images)
+
+
+@STATISTICS.case("points in a frame of one pixel", "No neighbor to be like, no window to guide the upsampling.")
+def _() -> None:
+    estimated(torch.tensor([[-0.9, -0.7, 2.0]]), photos(6, (1, 1, 3)))
 
 
 @STATISTICS.parametrize

@@ -223,7 +223,6 @@ for _method in ("ssa-splatfacto", "ssa-splatfacto-mcmc"):
 )
 @TRAINING.case("two points", "Fewer than the neighbors that a size is made of.", lambda xyz: xyz[:2])
 @TRAINING.case("a single point", "No neighbor at all.", lambda xyz: xyz[:1])
-@TRAINING.case("no points", "Nothing to start from.", lambda xyz: xyz[:0])
 @TRAINING.case(
     "points that are not finite",
     "One NaN spoils the search for neighbors.",
@@ -236,6 +235,12 @@ for _method in ("ssa-splatfacto", "ssa-splatfacto-mcmc"):
 )
 def _points(change: Callable[[np.ndarray], np.ndarray], runs: Trainings) -> None:
     runs.train(runs.dataset(edit=points(change)), num_random=500)
+
+
+@TRAINING.case("no points", "Nothing to start from.")
+def _(runs: Trainings) -> None:
+    with pytest.raises(InputError, match="it holds no points"):
+        runs.train(runs.dataset(edit=points(lambda xyz: xyz[:0])))
 
 
 @TRAINING.case("photos smaller than SSIM's window", "Reduced photos have no window left.")
