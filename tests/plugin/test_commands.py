@@ -82,7 +82,8 @@ def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
     words = [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=OFFLINE)
     deadline = time.monotonic() + 240
-    while not list(output.rglob("step-*.ckpt")):
+    # Not `rglob`: it also finds the checkpoint that is still being written beside the folder.
+    while not list(output.glob("*/*/*/nerfstudio_models/step-*.ckpt")):
         assert process.poll() is None
         assert time.monotonic() < deadline
         time.sleep(0.05)
