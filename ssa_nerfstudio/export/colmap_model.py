@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.errors import InputError
 
@@ -43,8 +44,7 @@ def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[st
     Raises:
         InputError: the points cannot be read.
     """
-    import pycolmap  # late: see sfm/colmap.py
-
+    pycolmap = import_pycolmap()
     applied = np.eye(4)
     applied[:3] = meta.get("applied_transform", applied[:3])
     to_colmap = np.linalg.inv(applied)
