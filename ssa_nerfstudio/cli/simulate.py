@@ -16,10 +16,10 @@ from ssa_nerfstudio.errors import InputError
 class Command:
     """Add an artifact to the training photos of a nerfstudio dataset; test photos stay clean."""
 
-    data: Path
-    """Dataset to read: the folder with transforms.json, or the .json file."""
     output: Path
     """Dataset to write; must not exist."""
+    data: Path | None = None
+    """Dataset to read: the folder with transforms.json, or the .json file; the built-in scene where it is left out."""
     effects: tuple[str, ...] | None = None
     """From the scene outwards: watermark, ui, dashboard, rain, mud, finger, occlusion, vignette, dust, their variants
     by name, or .yaml files. `--effects` without a value copies the dataset and adds the split."""
@@ -44,7 +44,10 @@ class Command:
             InputError: the arguments, the dataset or a configuration cannot be used.
         """
 
+        import tempfile
+
         from ssa_nerfstudio.data.dataset import Dataset
+        from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
         from ssa_nerfstudio.experiments.simulation.scene import MAX_EXPOSURE, Scene, read_effects, read_scene
         from ssa_nerfstudio.experiments.simulation.simulator import simulate
 
@@ -60,8 +63,13 @@ class Command:
             if not 0 <= self.exposure <= MAX_EXPOSURE:
                 raise InputError(f"--exposure must be in [0, {MAX_EXPOSURE}], got {self.exposure}")
             scene = dataclasses.replace(scene, exposure=self.exposure)
-        dataset = Dataset.read(self.data, self.eval_interval, self.downscale_factor)
-        simulate(dataset, scene, self.output, self.threads)
+        with tempfile.TemporaryDirectory() as scratch:
+            data, name = self.data, None
+            if data is None:
+                data, name = Path(scratch) / "scene", "the built-in scene"
+                DemoScene().write(data, artifact=None)
+            dataset = Dataset.read(data, self.eval_interval, self.downscale_factor)
+            simulate(dataset, scene, self.output, self.threads, name)
 
         train, _, test = dataset.split
         console = plain_console()

@@ -42,12 +42,13 @@ def transforms(dataset: Dataset, names: dict[str, str]) -> dict[str, Any]:
     return meta
 
 
-def scene_record(dataset: Dataset, scene: Scene) -> str:
+def scene_record(dataset: Dataset, scene: Scene, name: str) -> str:
     """Return YAML of the effects and their provenance; it is a scene file that repeats the run.
 
     Args:
         dataset: the input.
         scene: effects that were put in front.
+        name: of the input.
     """
     train, val, test = dataset.split
     versions = {
@@ -65,7 +66,7 @@ def scene_record(dataset: Dataset, scene: Scene) -> str:
         "seed": scene.seed,
         **({"exposure": scene.exposure} if scene.exposure else {}),
         "provenance": {
-            "data": str(dataset.root),
+            "data": name,
             "downscale_factor": dataset.downscale_factor,
             "split": f"every {dataset.eval_interval}th view tests" if dataset.split_by_interval else "transforms.json",
             "views": {"train": len(train), "val": len(val), "test": len(test)},

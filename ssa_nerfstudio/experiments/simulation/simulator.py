@@ -17,7 +17,7 @@ from ssa_nerfstudio.experiments.simulation.provenance import scene_record, trans
 from ssa_nerfstudio.experiments.simulation.scene import Scene
 
 
-def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None:
+def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int, name: str | None = None) -> None:
     """Write the dataset with the scene's artifact in front of every training photo.
 
     Training photos become PNG: I = clip(T C + B, 0, 1) in the raw frame, rounded to 8 bits, each under its exposure
@@ -30,6 +30,7 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
         output: folder to make; it appears when complete.
         threads: photos in flight at once, at least 1; memory is proportional to it and to the photos' size, not to
             their number.
+        name: of the input in scene.yaml; None: its folder.
 
     Raises:
         InputError: the folder exists or cannot be written, or a file of the dataset is missing or cannot be used.
@@ -55,7 +56,7 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int) -> None
         if changed:
             for _ in corrupt(dataset, scene, names, folder, threads):
                 progress.advance(task)
-        (folder / "scene.yaml").write_text(scene_record(dataset, scene), encoding="utf-8")
+        (folder / "scene.yaml").write_text(scene_record(dataset, scene, name or str(dataset.root)), encoding="utf-8")
         # Last, because it makes the folder a dataset.
         (folder / "transforms.json").write_text(json.dumps(transforms(dataset, names), indent=4), encoding="utf-8")
 
