@@ -56,6 +56,8 @@ class Exposure(nn.Module):
         """The photos' paths relative to the dataset."""
         self.place: Place = "photo"
         """What exposure acts on."""
+        self.stated_place: Place | None = None
+        """What the user says that it acts on; None: the photos decide."""
 
     def of_view(self, view: int) -> PhotoExposure:
         """The exposure of a training view."""
@@ -85,7 +87,7 @@ def fit_checkpoint(exposure: Exposure | None, state: dict[str, Any], prefix: str
         prefix: of the exposures' entries in it.
 
     Raises:
-        InputError: one of the two has no exposures, or the checkpoint has those of other photos.
+        InputError: one of the two has no exposures, or the checkpoint has those of other photos or in another place.
     """
     saved = state.get(f"{prefix}transforms")
     if (saved is None) != (exposure is None):
@@ -98,7 +100,14 @@ def fit_checkpoint(exposure: Exposure | None, state: dict[str, Any], prefix: str
         return
     if not exposure.training:
         exposure.transforms.data = exposure.transforms.data.new_zeros(saved.shape)
-    elif state[f"{prefix}_extra_state"]["photos"] != exposure.photos:
+        return
+    there = state[f"{prefix}_extra_state"]
+    if exposure.stated_place not in (None, there["place"]):
+        raise InputError(
+            f"the checkpoint's exposure acts on the {there['place']}, this run's on the {exposure.stated_place}",
+            "resume without --pipeline.model.exposure-place",
+        )
+    if there["photos"] != exposure.photos:
         raise InputError(
             f"the checkpoint has the exposures of {len(saved)} photos, and this run's {len(exposure.photos)} are not "
             "the same in the same order",

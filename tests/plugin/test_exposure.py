@@ -251,6 +251,8 @@ def test_a_resumed_training_goes_on_with_its_exposures(train, strategy):
 def test_a_checkpoint_of_another_setting_or_of_other_photos_is_refused(train, trained):
     with pytest.raises(InputError, match="exposure affine"):
         train(steps=45, load_dir=trained.checkpoint_dir, exposure="off")
+    with pytest.raises(InputError, match="exposure acts on the photo, this run's on the scene"):
+        train(steps=45, load_dir=trained.checkpoint_dir, exposure_place="scene")
     photos = trained.pipeline.model.exposure.photos
     trained.pipeline.model.exposure.photos = photos[::-1]
     trained.save_checkpoint(39)
