@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import get_args
 
 import cv2
 import numpy as np
 
-FaceName = Literal["front", "right", "back", "left", "up", "down"]
-"""Where a face looks."""
+from ssa_nerfstudio.cameras.projections import FaceName
+
 FACE_NAMES: tuple[FaceName, ...] = get_args(FaceName)
 _AXES: dict[FaceName, tuple[tuple[int, int, int], ...]] = {
     "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),

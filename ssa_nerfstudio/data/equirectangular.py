@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
 
 import cv2
 import numpy as np
 
-from ssa_nerfstudio.cameras.panorama import FACE_NAMES, FaceName, panorama_faces
+from ssa_nerfstudio.cameras.panorama import FACE_NAMES, panorama_faces
+from ssa_nerfstudio.cameras.projections import FaceName, Projection
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
 
-Projection = Literal["auto", "perspective", "fisheye", "equirectangular"]
-"""Of photos; auto: as `wraps_around` says."""
 _LOOKED_AT = 5
 """Photos, or frames of videos, that are looked at."""
 _ROWS = 256

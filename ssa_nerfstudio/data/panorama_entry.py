@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ssa_nerfstudio.cameras.panorama import FACE_NAMES, Face, FaceName
+from ssa_nerfstudio.cameras.panorama import FACE_NAMES, Face
+from ssa_nerfstudio.cameras.projections import FaceName
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 
