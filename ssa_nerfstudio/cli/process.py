@@ -9,7 +9,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.cameras.projections import FaceName, Projection
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,11 +49,11 @@ class Command:
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighborhood."""
     min_registered: float = 0.5
     """Stop when less than this share of a pass's photos is registered."""
-    projection: Literal["auto", "perspective", "fisheye", "equirectangular"] = "auto"
+    projection: Projection = "auto"
     """What the photos are. fisheye gets lenses of OPENCV_FISHEYE, which training undistorts. Equirectangular (360
     degrees, 2:1) photos are cut into six perspective faces. auto takes 2:1 photos for such whose left edge continues
     the right one, and all others for perspective."""
-    leave_out: tuple[Literal["front", "right", "back", "left", "up", "down"], ...] = ()
+    leave_out: tuple[FaceName, ...] = ()
     """Faces of equirectangular photos to leave out, for example down, where only the operator or a tripod is seen."""
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     """All pairs of photos, or neighbors in time and pairs of keyframes; auto: all pairs up to 150 photos."""
@@ -143,9 +145,9 @@ class Command:
         if summary.repair is not None:
             console.print(f"{self.colmap}: {summary.repair.in_words()}")
         for each in summary.passes:
-            missing = ", ".join([*each.missing[:5], *["..."][: len(each.missing) > 5]])
-            left_out = f"; not: {missing}" if missing else ""
-            console.print(f"{each.count} of {each.photos} {each.name} photos registered{left_out}")
+            camera = f"{each.name}: " if len(summary.passes) > 1 else ""
+            left_out = f"; not: {name_list(each.missing)}" if each.missing else ""
+            console.print(f"{camera}{each.count} of {each.photos} photos registered{left_out}")
         if self.detect and not summary.masked:
             console.print("no opaque artifact was detected: nothing was masked")
         if summary.masked:

@@ -114,6 +114,12 @@ class Command:
         detection.check()
         work = None
         if is_dataset(self.photos):
+            if processing:
+                raise InputError(
+                    f"--process.{processing[0].removeprefix('--')}: {self.photos} is a dataset, whose photos have "
+                    "poses already",
+                    "leave it out, or give the folder of photos",
+                )
             frames = Transforms.read(self.photos)
             sizes = [frames.intrinsics(frame) for frame in frames.frames]
             longest = max(max(size.width, size.height) for size in sizes)

@@ -91,7 +91,7 @@ def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
     """Find the photos or videos of one pass, a source for each camera that took them.
 
     A folder without photos and videos of its own is a rig's: each of its subfolders is a camera and names it. Photos of
-    several sizes or EXIF orientations in one folder are those of `camera_1`, `camera_2`, ...: an artifact has its place
+    several sizes or EXIF orientations in one folder are those of `camera_0`, `camera_1`, ...: an artifact has its place
     in photos of one orientation.
 
     Args:
@@ -115,8 +115,8 @@ def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
         groups = _by_frame(photos)
         if len(groups) > 1 and min(map(len, groups.values())) >= min_photos:
             return [
-                _of_photos(f"camera_{number}", path, group, frame, videos if number == 1 else [])
-                for number, (frame, group) in enumerate(groups.items(), 1)
+                _of_photos(f"camera_{number}", path, group, frame, videos if number == 0 else [])
+                for number, (frame, group) in enumerate(groups.items())
             ]
     return [read_source(path, name, min_photos)]
 

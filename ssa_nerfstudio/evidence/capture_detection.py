@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import track
 
 from ssa_nerfstudio._system.ordered_map import ordered_map
+from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.cameras.groups import group_frames
 from ssa_nerfstudio.cameras.intervals import capture_order
 from ssa_nerfstudio.data.dataset import Dataset
@@ -36,7 +37,7 @@ class Camera:
     """The photos of one camera, as a stream."""
 
     name: str
-    """camera-1, ..., or the name of its folder; names its output's folder and its messages."""
+    """camera_0, ..., or the name of its folder or photos; names its output's folder and its messages."""
     count: int
     """Their number; approximate for videos."""
     photos: Callable[[int], Iterator[np.ndarray]]
@@ -56,7 +57,7 @@ def read_cameras(data: Path, frames: int) -> list[Camera]:
     """
     if data.suffix == ".json" or (data / "transforms.json").is_file():
         return _of_dataset(Dataset.read(data, eval_interval=8), data)
-    return [_of_source(source, frames) for source in read_sources(data, "camera-1", min_photos=MIN_PHOTOS)]
+    return [_of_source(source, frames) for source in read_sources(data, "camera_0", min_photos=MIN_PHOTOS)]
 
 
 def detect_camera(camera: Camera, threads: int, console: Console | None = None, draws: int = DRAWS) -> Detection:
@@ -75,8 +76,8 @@ def detect_camera(camera: Camera, threads: int, console: Console | None = None, 
     """
 
     def photos() -> Iterator[torch.Tensor]:
-        stream = camera.photos(threads)
-        stream = track(stream, camera.name, camera.count, transient=True, console=console, disable=console is None)
+        stream, hidden = camera.photos(threads), console is None or not console.is_terminal
+        stream = track(stream, camera.name, camera.count, transient=True, console=console, disable=hidden)
         return (torch.from_numpy(photo) for photo in stream)
 
     return detect_in_intervals(photos, draws)
@@ -91,7 +92,7 @@ def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = 
         threads: photos decoded at once; one per core where None.
 
     Returns:
-        One detection per camera, by name: `camera-1`, ..., or that of its folder.
+        One detection per camera, by name: `camera_0`, ..., or that of its folder or photos (`camera_names`).
 
     Raises:
         InputError: no usable photos, too few of them, or one that cannot be decoded.
@@ -146,15 +147,16 @@ def _of_dataset(dataset: Dataset, data: Path) -> list[Camera]:
     groups = group_frames(np.array(lenses, dtype=np.float64))
 
     cameras = []
-    for group in range(max(groups) + 1):
-        members = [view for view, at in zip(views, groups, strict=True) if at == group]
+    members_of = [[view for view, at in zip(views, groups, strict=True) if at == g] for g in range(max(groups) + 1)]
+    names = camera_names([[view.path for view in members] for members in members_of])
+    for name, members in zip(names, members_of, strict=True):
         members.sort(key=lambda view: capture_order(view.path))
         if len(members) < MIN_PHOTOS:
             raise InputError(
                 f"{data}: {members[0].path} is the only photo of its camera",
                 f"a static artifact takes at least {MIN_PHOTOS} to detect: add photos or remove this one",
             )
-        cameras.append(Camera(f"camera-{group + 1}", len(members), partial(ordered_map, dataset.read_photo, members)))
+        cameras.append(Camera(name, len(members), partial(ordered_map, dataset.read_photo, members)))
     return cameras
 
 

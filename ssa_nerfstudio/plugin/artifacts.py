@@ -46,6 +46,8 @@ class Artifacts(nn.Module):
         self._group_of_view: list[int | None] = []
         self.starts: list[str] = []
         """First photo of each group (`cameras.intervals`), of those with an overlay before the others."""
+        self.cameras: list[str] = []
+        """Name of each group's camera, in the same order."""
 
     def __len__(self) -> int:
         return len(self.overlays)
@@ -62,6 +64,7 @@ class Artifacts(nn.Module):
         groups: list[int],
         lenses: Tensor,
         starts: list[str] | None = None,
+        cameras: list[str] | None = None,
     ) -> None:
         """Assign an overlay to each camera group.
 
@@ -71,6 +74,7 @@ class Artifacts(nn.Module):
             groups: each training view's group.
             lenses: [G, LENS_VALUES], the groups' raw cameras (`camera_matching.describe_lenses`).
             starts: the groups' first photos, relative to the dataset; None where each camera is one group.
+            cameras: names of the groups' cameras; None: camera_0, camera_1, ...
         """
         device = self.camera_keys.device
         covered = torch.tensor([overlay is not None for overlay in overlays], dtype=torch.bool)
@@ -79,7 +83,9 @@ class Artifacts(nn.Module):
         self.bare_keys = keys[~covered].to(device)
         self._remember_keys()
         starts = starts or [BEGINNING] * len(keys)
-        self.starts = [start for there in (True, False) for start, c in zip(starts, covered, strict=True) if c == there]
+        cameras = cameras or [f"camera_{number}" for number in range(len(keys))]
+        order = [group for there in (True, False) for group, c in enumerate(covered.tolist()) if c == there]
+        self.starts, self.cameras = [starts[group] for group in order], [cameras[group] for group in order]
         place = torch.where(covered, covered.cumsum(0) - 1, -1).tolist()
         self._group_of_view = [place[group] if place[group] >= 0 else None for group in groups]
 
@@ -124,10 +130,8 @@ class Artifacts(nn.Module):
         return same[interval_at(photo, [self.starts[other] for other in same])]
 
     def name(self, group: int) -> str:
-        """camera_0, or camera_0_interval_2 where its artifact changes; intervals are counted from 1."""
-        cameras = [self._keys[g] for g in range(len(self)) if self._intervals(g)[0] == g]
-        same = self._intervals(group)
-        name = f"camera_{cameras.index(self._keys[group])}"
+        """camera_0 or front, camera_0_interval_2 where its artifact changes; intervals are counted from 1."""
+        same, name = self._intervals(group), self.cameras[group]
         if len(same) == 1:
             return name
         order = sorted(same, key=lambda other: capture_order(self.starts[other]))
@@ -145,11 +149,11 @@ class Artifacts(nn.Module):
 
     def get_extra_state(self) -> dict[str, list[str]]:
         """What a checkpoint holds beside the tensors."""
-        return {"starts": self.starts}
+        return {"starts": self.starts, "cameras": self.cameras}
 
     def set_extra_state(self, state: dict[str, list[str]]) -> None:
         """Take what a checkpoint holds."""
-        self.starts = [str(start) for start in state["starts"]]
+        self.starts, self.cameras = ([str(value) for value in state[name]] for name in ("starts", "cameras"))
 
     @torch.no_grad()
     def coverage(self, group: int) -> tuple[Tensor, Tensor]:
@@ -230,7 +234,7 @@ class Artifacts(nn.Module):
                 f"the checkpoint was trained with overlay {here}, this run has {setting}",
                 f"resume with --pipeline.model.overlay {('auto' if here == 'off' else here)}",
             )
-        known = torch.cat([state.get(f"{prefix}{name}", torch.zeros(0, 6)) for name in ("camera_keys", "bare_keys")])
+        known = _keys_in(state, prefix)
         if not len(known):  # checkpoints from before groups without an overlay were recorded
             self._group_of_view = [None] * len(groups)
             return
@@ -246,21 +250,9 @@ class Artifacts(nn.Module):
                 )
             places.append(place)
         self._keys, self._bare = known[: len(self)].tolist(), known[len(self) :].tolist()
-        self.starts = self._starts_in(state, prefix, len(known))
+        self.set_extra_state(_extra_state_in(state, prefix))
         found = [self.at_photo(places[group], photo) for group, photo in zip(groups, photos, strict=True)]
         self._group_of_view = [place if place < len(self) else None for place in found]
-
-    @staticmethod
-    def _starts_in(state: dict[str, Any], prefix: str, groups: int) -> list[str]:
-        """Of a checkpoint; those from before intervals have none.
-
-        Raises:
-            InputError: there are others than its groups have.
-        """
-        starts = state.get(f"{prefix}_extra_state", {"starts": [BEGINNING] * groups})["starts"]
-        if len(starts) != groups:
-            raise InputError(f"the checkpoint has {groups} groups of photos and {len(starts)} starts", "take another")
-        return list(starts)
 
     def _remember_keys(self) -> None:
         self._keys, self._bare = self.camera_keys.tolist(), self.bare_keys.tolist()
@@ -269,7 +261,29 @@ class Artifacts(nn.Module):
         for name in ("lenses", "bare_keys"):  # checkpoints of the first version have none
             state_dict.setdefault(prefix + name, getattr(self, name))
         if prefix + "camera_keys" in state_dict:  # nerfstudio also loads an empty state into the whole pipeline
-            groups = len(state_dict[prefix + "camera_keys"]) + len(state_dict[prefix + "bare_keys"])
-            state_dict[f"{prefix}_extra_state"] = {"starts": self._starts_in(state_dict, prefix, groups)}
+            state_dict[f"{prefix}_extra_state"] = _extra_state_in(state_dict, prefix)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._remember_keys()
+
+
+def _keys_in(state: dict[str, Any], prefix: str) -> Tensor:
+    """Cameras of a checkpoint's groups [G, 6], of those with an overlay before the others."""
+    return torch.cat([state.get(f"{prefix}{name}", torch.zeros(0, 6)) for name in ("camera_keys", "bare_keys")])
+
+
+def _extra_state_in(state: dict[str, Any], prefix: str) -> dict[str, list[str]]:
+    """What a checkpoint holds beside the tensors; those from before intervals and names get none of the former.
+
+    Raises:
+        InputError: it is of other groups than the checkpoint has.
+    """
+    keys = _keys_in(state, prefix).tolist()
+    numbers = [[key for at, key in enumerate(keys) if key not in keys[:at]].index(key) for key in keys]
+    extra = {"starts": [BEGINNING] * len(keys), "cameras": [f"camera_{number}" for number in numbers]}
+    extra |= state.get(f"{prefix}_extra_state", {})
+    for name, values in extra.items():
+        if len(values) != len(keys):
+            raise InputError(
+                f"the checkpoint has {len(keys)} groups of photos and {len(values)} {name}", "take another"
+            )
+    return extra

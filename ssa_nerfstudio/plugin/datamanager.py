@@ -122,16 +122,12 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
     @property
     def fixed_indices_eval_dataloader(self) -> list[tuple[Cameras, dict]]:  # type: ignore[override]
         """Cameras and photos of all test views; the cameras' metadata name the photos."""
-        return [self._named(camera, data) for camera, data in super().fixed_indices_eval_dataloader]
+        names = self.photo_names(self.eval_dataset)
+        return [_named(camera, data, names) for camera, data in super().fixed_indices_eval_dataloader]
 
     def next_eval_image(self, step: int) -> tuple[Cameras, dict]:
         """One test view, likewise."""
-        return self._named(*super().next_eval_image(step))
-
-    def _named(self, camera: Cameras, data: dict) -> tuple[Cameras, dict]:
-        photo = self.photo_names(self.eval_dataset)[data["image_idx"]]
-        camera.metadata = {**metadata(camera), "photo": photo}
-        return camera, data
+        return _named(*super().next_eval_image(step), self.photo_names(self.eval_dataset))
 
     def next_train(self, step: int) -> tuple[Cameras, dict]:
         """Camera and photo of one training view; every view once before any comes again.
@@ -147,3 +143,9 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
         data = photos[index].copy()
         data["image"] = data["image"].to(self.device, non_blocking=True)
         return self._train_views[index], data
+
+
+def _named(camera: Cameras, data: dict, names: list[str]) -> tuple[Cameras, dict]:
+    """The view, whose camera's metadata name its photo."""
+    camera.metadata = {**metadata(camera), "photo": names[data["image_idx"]]}
+    return camera, data

@@ -38,7 +38,7 @@ def check_masks(photos: list[dict[str, Any]], groups: list[int]) -> None:
         if any(photo.get("mask") is None for photo in views):
             continue
         masks = [photo["mask"][..., 0] != 0 for photo in views]
-        name = "the mask" if len({*groups}) == 1 else f"the mask of camera {group + 1}"
+        name = "the mask" if len({*groups}) == 1 else f"the mask of camera_{group}"
         used, same = float(sum(mask.float().mean() for mask in masks)) / len(masks), _all_equal(masks)
         if used < _MIN_USED:
             problem = f"{name} keeps {used:.1%} of the frame"

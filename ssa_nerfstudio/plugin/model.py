@@ -289,7 +289,7 @@ class SSASplatfactoModel(SplatfactoModel):
     ) -> tuple[dict[str, float], dict[str, Tensor]]:
         """Compare the clean render with a test photo: psnr (dB), ssim ("valid" padding), flip, mean color deviation.
 
-        `composite_psnr` compares the composite: the metric to read where test photos carry the artifact, too.
+        `composite_psnr` is the composite's: read it where test photos carry the artifact. `cc_psnr`: `view_metrics`.
         """
         target = self.target(outputs, batch)
         return view_metrics(outputs, target), view_images(outputs, target)

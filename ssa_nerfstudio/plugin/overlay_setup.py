@@ -12,6 +12,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 
+from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.change_points import change_points
@@ -34,6 +35,8 @@ class LearnedGroup:
     """Their numbers."""
     start: str
     """Name of the first, or BEGINNING (`cameras.intervals`)."""
+    camera: str
+    """Name of their camera."""
     overlay: ScreenSpaceOverlay | None
     """None where no artifact is detected, under overlay "auto"."""
 
@@ -61,9 +64,10 @@ def learned_overlays(
         gains: of the photos [V, 3], where their exposure varies; colors of points are compared without them.
     """
     learned = []
-    for camera, size in enumerate(sizes):
-        name = "the photos" if len(sizes) == 1 else f"the photos of camera {camera + 1} of {len(sizes)}"
-        members = [index for index, at in enumerate(groups) if at == camera]
+    photos_of = [[index for index, at in enumerate(groups) if at == camera] for camera in range(len(sizes))]
+    called = camera_names([[names[index] for index in members] for members in photos_of])
+    for members, size, camera in zip(photos_of, sizes, called, strict=True):
+        name = "the photos" if len(sizes) == 1 else f"the photos of {camera}"
         members.sort(key=lambda index: capture_order(names[index]))
         statistics, intervals = None, [members]
         if config.overlay == "auto" or config.overlay_start != "constant":
@@ -76,12 +80,12 @@ def learned_overlays(
         for number, interval in enumerate(intervals):
             views, part = [photos[index] for index in interval], name
             if len(intervals) > 1:
-                part = f"{name} of interval {number + 1}"
+                part = f"{name} from {Path(names[interval[0]]).name} to {Path(names[interval[-1]]).name}"
                 statistics = _statistics(views, part)
             own = None if gains is None else gains[interval]
             view_cameras = cameras[torch.tensor(interval)]
             overlay = _learned_overlay(config, statistics, views, view_cameras, points, size, part, own)
-            learned.append(LearnedGroup(interval, names[interval[0]] if number else BEGINNING, overlay))
+            learned.append(LearnedGroup(interval, names[interval[0]] if number else BEGINNING, camera, overlay))
     return learned
 
 

@@ -108,7 +108,8 @@ class SSAPipeline(VanillaPipeline):
         if exposure is None:
             return None
         exposure.photos = self.datamanager.photo_names(photos)
-        exposure.place = "photo" if place == "auto" else place
+        exposure.stated_place = None if place == "auto" else place
+        exposure.place = exposure.stated_place or "photo"
         if self.config.artifacts_of:
             return None  # of a resumed run
         return start_from_points(exposure, self.datamanager.cached_train, photos.cameras, self._points())
@@ -140,22 +141,23 @@ class SSAPipeline(VanillaPipeline):
         keys, groups = group_cameras(self.datamanager.train_dataset.cameras)
         sizes = [(int(key[1]), int(key[0])) for key in keys]
         artifacts = self.model.artifacts
-        starts, names = None, self.datamanager.photo_names(self.datamanager.train_dataset)
+        starts, cameras, names = None, None, self.datamanager.photo_names(self.datamanager.train_dataset)
         if resumed is not None:
             artifacts.resume_from(resumed, "_model.artifacts.", keys, groups, setting, names)
             return
         if setting == "given":
             overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
-            cameras, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
+            views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
             gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
-            learned = learned_overlays(self.config.model, photos, names, cameras, self._points(), groups, sizes, gains)
-            overlays, starts = [each.overlay for each in learned], [each.start for each in learned]
+            learned = learned_overlays(self.config.model, photos, names, views, self._points(), groups, sizes, gains)
+            overlays = [each.overlay for each in learned]
+            starts, cameras = [each.start for each in learned], [each.camera for each in learned]
             keys = keys[[groups[each.members[0]] for each in learned]]
             group_of = {view: group for group, each in enumerate(learned) for view in each.members}
             groups = [group_of[view] for view in range(len(photos))]
         first = [groups.index(g) for g in range(len(keys))]
-        artifacts.assign(overlays, keys, groups, lenses[first], starts)
+        artifacts.assign(overlays, keys, groups, lenses[first], starts, cameras)
 
 
 def _source(config: SSAPipelineConfig) -> Path:

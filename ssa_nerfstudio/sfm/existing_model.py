@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.data.photos import UPRIGHT
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
@@ -113,10 +114,7 @@ def _load(folder: Path) -> pycolmap.Reconstruction:
     trial = [sys.executable, "-c", "import sys, pycolmap; pycolmap.Reconstruction(sys.argv[1])", str(folder)]
     if not sound or subprocess.run(trial, capture_output=True).returncode:
         raise InputError(f"{folder} cannot be read as a model of COLMAP", "export it again, or leave out --colmap")
-    import PIL.Image  # noqa: F401 - before pycolmap, see colmap.py
-    import pycolmap
-
-    return pycolmap.Reconstruction(folder)
+    return import_pycolmap().Reconstruction(folder)
 
 
 def _by_camera(
@@ -139,7 +137,7 @@ def _by_camera(
         exact = present[file].camera_id if file in present else camera
         members[exact if exact in own else camera].append(file)
     divided = []
-    for number, (camera, files) in enumerate(members.items(), 1):
+    for number, (camera, files) in enumerate(members.items()):
         name = source.name if len(own) == 1 else f"{re.sub('^frame$', 'camera', source.name)}_{number}"
         cameras = [model.cameras[c] for c in ([camera] if used.count(camera) >= _MIN_PHOTOS else {*used})]
         lens = np.median([_lens(each) for each in cameras], axis=0).tolist()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio.sfm.existing_model import ExistingModel
 from ssa_nerfstudio.sfm.ingest import Photo
 
@@ -81,4 +82,4 @@ class Repair:
 
 def _some(names: Sequence[str]) -> str:
     """Their number, and the first of them."""
-    return f"{len(names)} ({', '.join([*names[:5], *['...'][: len(names) > 5]])})"
+    return f"{len(names)} ({name_list(names)})"

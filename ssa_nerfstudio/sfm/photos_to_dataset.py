@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import PIL.Image
 
+from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.panorama import cut
 from ssa_nerfstudio.data.sources import Source
@@ -120,7 +121,9 @@ def process(
             check_registrations(registered, min_registered, "user" if mask is not None else detected)
         except InputError as error:
             work.keep_after_error = True
-            remedy = f"{error.remedy}; a run that requires fewer continues from the work in {work.path}"
+            remedy = (
+                f"{error.remedy}; the same command with a lower --min-registered continues (its work is in {work.path})"
+            )
             raise InputError(error.problem, remedy) from error
         assert model is not None
         check_lenses(names, model)
@@ -244,10 +247,7 @@ def _flatten(
 
 
 def _load(model: Path) -> pycolmap.Reconstruction:
-    # Late, because COLMAP replaces the signal handlers; after PIL, because saving a PNG would abort otherwise.
-    import pycolmap
-
-    return pycolmap.Reconstruction(model)
+    return import_pycolmap().Reconstruction(model)
 
 
 def _digest(mask: np.ndarray | None) -> str | None:

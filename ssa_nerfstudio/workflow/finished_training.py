@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.plugin.camera_matching import find_frame, group_cameras
 from ssa_nerfstudio.plugin.evaluation import view_metrics
@@ -23,6 +24,16 @@ _FILE = "evaluation.json"
 
 
 @dataclass(frozen=True)
+class PicturedGroup:
+    """The photos of one camera, or of one interval of it where the artifact changes."""
+
+    title: str
+    """Name of the camera, and where the interval begins."""
+    overlay: str | None
+    """Name of their overlay (`Artifacts.name`); None where they have none."""
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Metrics of the test views."""
 
@@ -32,13 +43,14 @@ class Evaluation:
     """Metrics by the photo's name."""
     clean_test_views: bool
     """See `Transforms.test_photos_are_clean`."""
-    overlays: list[int | None] = field(default_factory=list)
-    """Which of the run's overlays each camera has, in the order of `write_view_pictures`; None where it has none."""
+    pictured: list[PicturedGroup] = field(default_factory=list)
+    """What `write_view_pictures` shows, in its order."""
 
     @staticmethod
     def read(folder: Path) -> Evaluation:
         """Read what `write` wrote."""
-        return Evaluation(**json.loads((folder / _FILE).read_text(encoding="utf-8")))
+        values = json.loads((folder / _FILE).read_text(encoding="utf-8"))
+        return Evaluation(**{**values, "pictured": [PicturedGroup(**each) for each in values["pictured"]]})
 
     def write(self, folder: Path) -> None:
         """Write evaluation.json."""
@@ -62,18 +74,26 @@ def evaluate(pipeline: SSAPipeline, data: Path, on_progress: ProgressCallback) -
         on_progress("test view", len(views), len(names))
     keys = next(iter(views.values()))
     means = {key: sum(view[key] for view in views.values()) / len(views) for key in keys}
-    return Evaluation(means, views, Transforms.read(data).test_photos_are_clean, _overlays(pipeline))
+    return Evaluation(means, views, Transforms.read(data).test_photos_are_clean, _pictured(pipeline))
 
 
-def _overlays(pipeline: SSAPipeline) -> list[int | None]:
+def _pictured(pipeline: SSAPipeline) -> list[PicturedGroup]:
     artifacts = pipeline.model.artifacts
+    names = [artifacts.name(group) for group in range(len(artifacts))]
     if artifacts.changes:
-        return list(range(len(artifacts)))  # pictures are of intervals
-    _ = pipeline.datamanager.cached_train  # undistorts the photos and rewrites their cameras
-    keys, _ = group_cameras(pipeline.datamanager.train_dataset.cameras)
+        starts = [Path(artifacts.starts[group]).name or "the first photo" for group in range(len(artifacts))]
+        several = len({*artifacts.cameras}) > 1
+        cameras = [f"{artifacts.cameras[group]}, " if several else "" for group in range(len(artifacts))]
+        return [PicturedGroup(f"{c}from {s}", name) for c, s, name in zip(cameras, starts, names, strict=True)]
+    photos = pipeline.datamanager.cached_train  # undistorts the photos and rewrites their cameras
+    dataset = pipeline.datamanager.train_dataset
+    keys, groups = group_cameras(dataset.cameras)
+    paths = pipeline.datamanager.photo_names(dataset)
+    members = [[paths[view] for view in range(len(photos)) if groups[view] == group] for group in range(len(keys))]
     known = torch.cat([artifacts.camera_keys, artifacts.bare_keys]).cpu()
-    places = [find_frame(key, known) for key in keys] if len(artifacts) else [None] * len(keys)
-    return [place if place is not None and place < len(artifacts) else None for place in places]
+    places = [find_frame(key, known) for key in keys] if names else [None] * len(keys)
+    overlays = [names[place] if place is not None and place < len(names) else None for place in places]
+    return [PicturedGroup(title, overlay) for title, overlay in zip(camera_names(members), overlays, strict=True)]
 
 
 @torch.no_grad()

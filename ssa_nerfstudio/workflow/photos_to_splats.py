@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
@@ -97,10 +98,10 @@ def detect_with_progress(
     return {camera.name: detect_camera(camera, threads, draws=draws) for camera in streams}
 
 
-def artifact_files(overlays: int) -> list[tuple[str, str]]:
-    """Names of each camera's artifact and matte, given the number of overlays."""
-    numbers = [""] if overlays == 1 else [f"-{number}" for number in range(1, overlays + 1)]
-    return [(f"artifact{number}.png", f"matte{number}.png") for number in numbers]
+def artifact_files(overlays: Sequence[str]) -> list[tuple[str, str]]:
+    """Files of each overlay's artifact and matte, given the overlays' names."""
+    ends = [""] if len(overlays) == 1 else [f"-{name}" for name in overlays]
+    return [(f"artifact{end}.png", f"matte{end}.png") for end in ends]
 
 
 def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
@@ -122,7 +123,7 @@ def _process(plan: Plan, process: Callable[[ProgressCallback], Summary], on_prog
     summary = process(on_progress)
     registered, photos = sum(each.count for each in summary.passes), sum(each.photos for each in summary.passes)
     missing = [name for each in summary.passes for name in each.missing]
-    warning = f"no pose was found for {', '.join(missing[:5])}{', ...' * (len(missing) > 5)}; where parts of the "
+    warning = f"no pose was found for {name_list(missing)}; where parts of the "
     warning += "scene are missing, add photos between them and their neighbors"
     repaired = "" if summary.repair is None else f"; of the model, {summary.repair.in_words()}"
     return Result(
@@ -170,7 +171,8 @@ def _export(plan: Plan, on_progress: ProgressCallback) -> Result:
         on_progress("file", 1, 2 + 2 * len(layers))
         write_compressed_ply(plan.output / COMPRESSED, gaussians, kept)
         write_exposure(checkpoint, plan.output)
-        for number, (names, layer) in enumerate(zip(artifact_files(len(layers)), layers, strict=True)):
+        files = artifact_files([layer.name for layer in layers])
+        for number, (names, layer) in enumerate(zip(files, layers, strict=True)):
             rgba = to_rgba8(torch.from_numpy(layer.transmittance), torch.from_numpy(layer.addition))
             for name, pixels in zip(names, (rgba, rgba[..., 3]), strict=True):
                 with staged_file(plan.output / name) as part:

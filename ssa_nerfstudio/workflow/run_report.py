@@ -22,8 +22,9 @@ REPORT = "report.html"
 
 @dataclass(frozen=True)
 class CameraPictures:
-    """Of one camera."""
+    """Of one camera, or of one interval of it."""
 
+    title: str
     photo: Path
     clean: Path
     ratio: float
@@ -47,7 +48,7 @@ def report_page(
             unless it changes.
     """
     evaluation = Evaluation.read(output / EVALUATION)
-    whole = [output / name for name in artifact_files(1)[0]]
+    whole = [output / name for name in artifact_files([""])[0]]
     sphere = whole if on_sphere and whole[0].exists() else []
     cameras = _cameras(output, evaluation, bool(sphere))
     exposed = (output / EXPOSURE).exists()
@@ -74,20 +75,18 @@ def report_page(
 
 def _cameras(output: Path, evaluation: Evaluation, on_sphere: bool) -> list[CameraPictures]:
     """The pictures of every camera, with those of its own artifact where it has one."""
-    folder = output / EVALUATION
-    count = len(list(folder.glob("photo-*.jpg")))
-    places = [None] * count if on_sphere else evaluation.overlays or list(range(count))
-    files = artifact_files(sum(place is not None for place in places))
-    overlays = [(None, None) if place is None else [output / name for name in files[place]] for place in places]
-    return [
-        CameraPictures(
-            folder / f"photo-{number}.jpg",
-            folder / f"clean-{number}.jpg",
-            _ratio(folder / f"photo-{number}.jpg"),
-            *(path if path is not None and path.exists() else None for path in overlays[number - 1]),
+    folder, groups = output / EVALUATION, evaluation.pictured
+    names = [] if on_sphere else [group.overlay for group in groups if group.overlay is not None]
+    files = dict(zip(names, artifact_files(names), strict=True))
+    cameras = []
+    for number, group in enumerate(groups, 1):
+        own = [output / file for file in files.get(group.overlay or "", ())]
+        artifact, matte = own if own and own[0].exists() else (None, None)
+        photo = folder / f"photo-{number}.jpg"
+        cameras.append(
+            CameraPictures(group.title, photo, folder / f"clean-{number}.jpg", _ratio(photo), artifact, matte)
         )
-        for number in range(1, count + 1)
-    ]
+    return cameras
 
 
 def _ratio(picture: Path) -> float:
@@ -99,7 +98,7 @@ def _figures(evaluation: Evaluation, exposed: bool) -> list[tuple[str, str, str]
     """Name, value and meaning of what was measured on the test views; `exposed`: whether exposures were learned."""
     metrics = evaluation.metrics
     rows, corrected = [], []
-    if "composite_psnr" in metrics:
+    if "composite_psnr" in metrics and not evaluation.clean_test_views:
         value = f"{metrics['composite_psnr']:.2f} dB"
         rows.append(("PSNR with the artifact", value, "splats and artifact, as the photos are"))
     if exposed and "cc_psnr" in metrics:

@@ -95,8 +95,8 @@ def test_photos_in_portrait_and_landscape_are_two_cameras(tmp_path):
         Image.new("RGB", (64, 48)).save(tmp_path / f"{number}.png", exif=exif)
     landscape, portrait = read_sources(tmp_path, "frame", min_photos=3)
     assert [path.name for path in portrait.photos] == ["4.png", "5.png", "6.png"]
-    assert (landscape.name, landscape.width, landscape.height) == ("camera_1", 64, 48)
-    assert (portrait.name, portrait.width, portrait.height, portrait.orientation) == ("camera_2", 48, 64, 6)
+    assert (landscape.name, landscape.width, landscape.height) == ("camera_0", 64, 48)
+    assert (portrait.name, portrait.width, portrait.height, portrait.orientation) == ("camera_1", 48, 64, 6)
     (tmp_path / "6.png").unlink()
     with pytest.raises(InputError, match=r"4.png has EXIF orientation 6, 0.png has 1"):
         read_sources(tmp_path, "frame", min_photos=3)

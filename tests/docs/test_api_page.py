@@ -35,7 +35,7 @@ def test_the_program_is_short():
 
 
 def test_detection_finds_the_dashboard(names):
-    assert names["camera"] == "camera-1"
+    assert names["camera"] == "camera_0"
     assert names["found"].verdict == "opaque"
     assert names["found"].mask.shape == (48, 64)
 

@@ -92,7 +92,7 @@ def test_a_dataset_is_tested_per_camera_on_its_training_photos(tiny_scene, tmp_p
     assert first["verdict"] == second["verdict"] == "opaque"
     assert {(g["width"], g["height"]) for g in (first, second)} == {(64, 48), (32, 24)}
     assert first["views"] == second["views"] == 12
-    assert sorted(p.name for p in (tmp_path / "found").iterdir()) == ["camera-1", "camera-2"]
+    assert sorted(p.name for p in (tmp_path / "found").iterdir()) == ["small_train", "train"]
 
 
 def test_without_an_output_the_last_result_of_that_name_is_replaced(tmp_path, monkeypatch):

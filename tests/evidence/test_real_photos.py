@@ -37,7 +37,7 @@ def test_a_real_bonnet_is_found_and_the_constant_sky_stays_out_of_the_overlay(
 ):
     """The default settings. 60 steps move a matte little from where it starts: clear on the bonnet, too."""
     data = captures / "dashcam_hood"
-    found = detect_artifacts(data)["camera-1"]
+    found = detect_artifacts(data)["camera_0"]
     bonnet = np.array(Image.open(data / "artifact_mask_approx.png").convert("L")) > 127
     assert found.verdict != "none"
     assert found.mask[torch.from_numpy(bonnet)].float().mean() > 0.3

@@ -20,7 +20,7 @@ from ssa_nerfstudio.evidence.capture_detection import detect_artifacts
 from ssa_nerfstudio.export.capture_artifact import LearnedArtifact
 from ssa_nerfstudio.export.checkpoint import Checkpoint
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
-from ssa_nerfstudio.workflow.finished_training import evaluate, write_view_pictures
+from ssa_nerfstudio.workflow.finished_training import PicturedGroup, evaluate, write_view_pictures
 
 HALF = 12
 
@@ -152,4 +152,7 @@ def test_one_that_is_replaced_has_an_overlay_for_each_interval(half, tmp_path, c
     trainer.pipeline.eval()
     write_view_pictures(trainer.pipeline, tmp_path)
     assert {path.name for path in tmp_path.glob("photo-*.jpg")} == {"photo-1.jpg", "photo-2.jpg"}
-    assert evaluate(trainer.pipeline, scene, lambda *_: None).overlays == [0, 1]
+    assert evaluate(trainer.pipeline, scene, lambda *_: None).pictured == [
+        PicturedGroup("from the first photo", "camera_0_interval_1"),
+        PicturedGroup(f"from {Path(artifacts.starts[1]).name}", "camera_0_interval_2"),
+    ]

@@ -114,7 +114,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path, capsys, photos):
     assert not (tmp_path / "out").exists()
     assert list(tmp_path.glob(".out.work/motion/database.db"))
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "12 of 12 frame photos registered" in done.stdout
+    assert "12 of 12 photos registered" in done.stdout
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "photos"]
 
 
@@ -122,7 +122,7 @@ def test_an_opaque_artifact_is_detected_and_masked(tmp_path, capsys, covered, dr
     write(tmp_path / "photos", covered)
     process("--train", tmp_path / "photos", "--output", tmp_path / "out", "--detect", "--no-flatten")
     said = capsys.readouterr().out
-    assert f"{VIEWS} of {VIEWS} frame photos registered" in said
+    assert f"{VIEWS} of {VIEWS} photos registered" in said
     used = np.asarray(Image.open(tmp_path / "out/mask_colmap.png"))
     true = draw_effect("dashboard", HEIGHT, WIDTH).transmittance.min(axis=-1) > 0.9
     assert used.shape == true.shape

@@ -42,7 +42,7 @@ def test_artifact_photos_train_and_clean_photos_judge_and_the_matte_is_a_mask_fo
         sys.executable, "-m", "ssa_nerfstudio", "process", "--train", train, "--clean", clean, "--output", data,
         "--threads", 1, "--min-registered", 0.9,
     )  # fmt: skip
-    assert "8 of 8 train photos registered\n8 of 8 clean photos registered\n" in said
+    assert "train: 8 of 8 photos registered\nclean: 8 of 8 photos registered\n" in said
     run(
         BIN / "ns-train", "ssa-splatfacto", "--data", data, "--output-dir", tmp_path / "runs", "--vis", "tensorboard",
         "--max-num-iterations", 120, "--timestamp", "t", "--pipeline.model.num-downscales", 1,

@@ -177,6 +177,7 @@ def test_the_page_fits_a_narrow_window_and_its_line_can_be_moved(finished):
         (["--train.pipeline.model.overlay", "maybe"], "(ns-train ssa-splatfacto --help)"),
         (["--train.no-such-option", "1"], "Unrecognized options: --no-such-option"),
         (["--nonsense", "1"], "Unrecognized options: --nonsense"),
+        (["--process.matching", "sequential"], "--process.matching: "),
     ],
 )
 def test_wrong_options_end_before_any_work(tiny_scene, tmp_path, capsys, options, expected):
@@ -231,13 +232,13 @@ def test_a_rig_of_two_cameras_gets_an_overlay_each(tmp_path, photos, draw_effect
     assert "side: a static artifact over" in stages["detect"]
     assert stages["process"].startswith(f"{2 * VIEWS} of {2 * VIEWS} photos have poses")
     assert stages["train"].startswith("the artifacts of 2 cameras were learned")
-    front, top = (np.asarray(Image.open(out / f"matte-{number}.png")) / 255 for number in (1, 2))
+    front, top = (np.asarray(Image.open(out / f"matte-{name}.png")) / 255 for name in ("front", "side"))
     assert abs(front.shape[1] - top.shape[1] - 32) <= 2
     assert front[-20:].mean() > 0.8 > 0.2 > front[:20].mean()
     assert top[4:28].mean() > 0.8 > 0.2 > top[-40:].mean()
     page = (out / "report.html").read_text()
     assert page.count("data:image/jpeg;base64,") == 4
-    assert "Camera 2" in page
+    assert "<h2>side</h2>" in page
     config = str(out / "training/ssa-splatfacto/config.yml")
     main(["export-dataset", "--for", "colmap", "--load-config", config, "--output", str(tmp_path / "masked")])
     masks = sorted((tmp_path / "masked/masks").iterdir())

@@ -1,0 +1,38 @@
+"""Names of a capture's cameras, from the names of their photos."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from itertools import takewhile
+from pathlib import PurePosixPath
+
+
+def camera_names(photos: Sequence[Sequence[str]]) -> list[str]:
+    """What the names of each camera's photos begin with, as in front_0001.jpg or images/front/1.jpg: "front".
+
+    Args:
+        photos: of each camera, paths relative to the dataset; at least one photo each.
+
+    Returns:
+        A name for each camera; camera_0, camera_1, ... where it is the only one, or their photos' names do not tell
+        them apart.
+    """
+    if len(photos) == 1:
+        return ["camera_0"]
+    for names in ([_folder(each) for each in photos], [_first_words(each) for each in photos]):
+        if all(names) and len({*names}) == len(names):
+            return names
+    return [f"camera_{number}" for number in range(len(photos))]
+
+
+def _folder(photos: Sequence[str]) -> str:
+    """Folder of all photos below the dataset's images/ or images_2/; empty where there is none."""
+    folders = {"_".join(PurePosixPath(photo).parts[1:-1]) for photo in photos}
+    return folders.pop() if len(folders) == 1 else ""
+
+
+def _first_words(photos: Sequence[str]) -> str:
+    """Words with which all file names begin, up to the first number."""
+    words = [re.findall(r"[^\W\d_]+", re.split(r"\d", PurePosixPath(photo).stem)[0]) for photo in photos]
+    return "_".join(each[0] for each in takewhile(lambda each: len({*each}) == 1, zip(*words, strict=False)))

@@ -1,0 +1,26 @@
+"""Names of cameras, from the names of their photos."""
+
+from __future__ import annotations
+
+import pytest
+
+from ssa_nerfstudio.cameras.camera_names import camera_names
+
+
+@pytest.mark.parametrize(
+    ("photos", "names"),
+    [
+        ([["images/front_00001.jpg", "images/front_00012.jpg"], ["images/side_00001.jpg"]], ["front", "side"]),
+        ([["images/left/1.png", "images/left/20.png"], ["images/right/1.png"]], ["left", "right"]),
+        ([["images_2/frame_up_00001.png"], ["images_2/frame_down_00001.png"]], ["frame_up", "frame_down"]),
+        ([["images/DSC_0001.jpg"], ["images/DSC_0002.jpg"]], ["camera_0", "camera_1"]),
+        ([["images/cat.jpg", "images/car.jpg"], ["images/dog.jpg"]], ["camera_0", "camera_1"]),
+        ([["images/front_a.jpg", "images/front_b.jpg"], ["images/rear_a.jpg", "images/rear_b.jpg"]], ["front", "rear"]),
+        ([["1.jpg"], ["2.jpg"]], ["camera_0", "camera_1"]),
+        ([["images/gopro 2/a 1.jpg", "images/gopro 2/b.jpg"], ["images/phone/x1.jpg", "images/phone/y.jpg"]],
+         ["gopro 2", "phone"]),
+        ([["images/frame_00001.jpg", "images/frame_00002.jpg"]], ["camera_0"]),
+    ],
+)  # fmt: skip
+def test_a_camera_is_called_what_its_photos_have_in_common(photos, names):
+    assert camera_names(photos) == names
