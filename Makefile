@@ -21,6 +21,9 @@ DEMO := outputs/demo
 # The built-in scene is small: every pixel from the start, and fewer new Gaussians than photos of megapixels need.
 DEMO_OPTIONS ?= $(if $(DATA),,--steps 800 --train.pipeline.model.num-downscales 0 --train.pipeline.model.densify-grad-thresh 0.006)
 
+# Two workers, on two cores: libraries that start a thread a core take twice as long, for what they wait for each other.
+PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
+
 .PHONY: setup demo docs test slow mutants stability lint bare format clean
 
 setup: $(READY)
@@ -41,16 +44,16 @@ docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -W ignore -m mkdocs build --strict
 
 test: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+	$(PYTEST)
 
 slow: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m slow
+	$(PYTEST) -m slow
 
 mutants: $(READY)
 	$(BIN)/python benchmarks/mutants.py --room $(ROOM)
 
 stability: $(READY)
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m "stability or not stability" tests/stability tests/plugin/training/test_nonfinite.py tests/plugin/training/test_checkpoints.py
+	$(PYTEST) -m "stability or not stability" tests/stability tests/plugin/training/test_nonfinite.py tests/plugin/training/test_checkpoints.py
 
 lint: $(READY)
 	$(BIN)/ruff check .

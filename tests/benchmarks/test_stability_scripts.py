@@ -10,6 +10,7 @@ import torch
 from benchmarks import divergence, guard_cost
 
 
+@pytest.mark.slow
 def test_divergence_is_noted_for_each_of_four_runs_and_drawn(tiny_scene, tmp_path):
     divergence.Command(data=tiny_scene, output=tmp_path, steps=20, cap_max=4200, every=5).run()
     runs = [json.loads(path.read_text()) for path in tmp_path.glob("*.json")]

@@ -167,14 +167,6 @@ def test_render_dataset_writes_every_layer(config, call, tmp_path):
     assert np.abs(pictures["rgb"][40:].astype(int) - pictures["composite"][40:]).mean() > 10
 
 
-def test_render_interpolate_writes_images(config, call, tmp_path):
-    call(
-        "ns-render", "interpolate", "--load-config", config, "--output-path", tmp_path / "frames",
-        "--output-format", "images", "--interpolation-steps", "2",
-    )  # fmt: skip
-    assert len(list((tmp_path / "frames").glob("*.jpg"))) >= 3
-
-
 def test_the_exported_splats_are_the_checkpoints_and_nothing_of_the_overlay(config, call, tmp_path):
     call("ns-export", "gaussian-splat", "--load-config", config, "--output-dir", tmp_path)
     vertex = PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
@@ -202,6 +194,11 @@ def test_as_processes(config, tmp_path):
     command("ns-export", "gaussian-splat", *run, "--output-dir", tmp_path)
     assert json.loads((tmp_path / "eval.json").read_text())["results"]["psnr"] > 10
     assert [*(tmp_path / "renders").rglob("*.jpg")]
+    command(
+        "ns-render", "interpolate", *run, "--output-path", tmp_path / "frames",
+        "--output-format", "images", "--interpolation-steps", "2",
+    )  # fmt: skip
+    assert len(list((tmp_path / "frames").glob("*.jpg"))) >= 3
     assert (tmp_path / "splat.ply").stat().st_size > 1000
 
 

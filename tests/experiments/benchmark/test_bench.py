@@ -153,6 +153,7 @@ def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monk
         assert there.read_bytes() == here.read_bytes()
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_runs_what_it_is_given(tmp_path):
     distributed = pytest.importorskip("distributed")
     path = tmp_path / "short.yaml"
@@ -173,6 +174,7 @@ def children() -> set[psutil.Process]:
     return {child for child in found if not any("resource_tracker" in word for word in child.cmdline())}
 
 
+@pytest.mark.slow
 def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tmp_path):
     """Runs that fail, for there is no dataset. A process that was killed while it waited is replaced."""
     folder = ResultsFolder(tmp_path)
@@ -198,6 +200,7 @@ def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tm
     assert list(folder.unfinished.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_a_process_that_was_killed_while_it_waited_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     runs = plan(benchmark())[:2]

@@ -18,6 +18,8 @@ from PIL import Image
 
 from ssa_nerfstudio.experiments.benchmark.results import read_all
 
+pytestmark = pytest.mark.slow
+
 SSA = (sys.executable, "-m", "ssa_nerfstudio")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
 DEADLINE = 400.0
