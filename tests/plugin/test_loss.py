@@ -82,9 +82,17 @@ def test_long_gaussians_are_penalized_every_tenth_step(model):
     for step, paid in ((0, True), (9, False), (10, True)):
         model.step = step
         assert ("scale_reg" in losses(model)) == paid
+    before = model.scales.detach().clone()
+    with torch.no_grad():
+        model.scales[::2, 1] += 2.0  # every other one is at least twice as long as wide
+        model.scales[1::2] = -3.0
     sizes = torch.exp(model.scales)
     ratio = sizes.amax(dim=-1) / sizes.amin(dim=-1)
-    torch.testing.assert_close(losses(model)["scale_reg"], 0.1 * (ratio.clamp_min(1.5) - 1.5).mean())
+    penalty = losses(model)["scale_reg"]
+    assert penalty > 0.05
+    torch.testing.assert_close(penalty, 0.1 * (ratio.clamp_min(1.5) - 1.5).mean())
+    with torch.no_grad():
+        model.scales.copy_(before)
 
 
 def test_harmonics_come_one_degree_at_a_time(model, trainer):
@@ -132,3 +140,21 @@ def test_the_means_rates_are_in_units_of_the_scene(trainer):
     finally:
         trainer.pipeline.model.scene_scale = 1.0
         trainer.config.optimizers = before
+
+
+@pytest.mark.parametrize("ignored", [True, False])
+def test_hiding_background_moves_the_matte_only_where_that_is_asked_for(model, trainer, ignored):
+    """No splat is seen, and the photo has the overlay's color."""
+    camera, _ = trainer.pipeline.datamanager.next_train(0)
+    model.config.ignore_background = ignored
+    overlay = model.artifacts.learned()[0]
+    before = model.opacities.detach().clone()
+    with torch.no_grad():
+        model.opacities.fill_(-20.0)
+    try:
+        shown = model.get_outputs(camera)["composite"]
+        (gradient,) = torch.autograd.grad((shown - overlay.color().detach()).square().mean(), overlay.alpha_logits)
+    finally:
+        with torch.no_grad():
+            model.opacities.copy_(before)
+    assert (gradient.abs().max() < 1e-9) == ignored

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu, relocated
-from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 
 WIDTH, HEIGHT = 40, 30
@@ -264,3 +265,31 @@ def test_noise_is_left_out_of_a_skipped_step():
         moved.append((params["means"] - before).abs().max().item())
     assert moved[0] > 0
     assert moved[1] == 0
+
+
+def test_mcmc_starts_from_small_half_transparent_gaussians_and_follows_the_settings():
+    params, _ = gaussians(30)
+    sizes = torch.exp(params["scales"].detach()).clone()
+    settings = ModelSettings(
+        strategy="mcmc", mcmc_scale_start=0.25, mcmc_opacity_start=0.4, cap_max=77, warmup_length=11,
+        mcmc_stop_at=222, refine_every=13, guards=False,
+    )  # fmt: skip
+    strategy = make_strategy(settings, {}, params)
+    assert isinstance(strategy, MarkovChainMonteCarlo)
+    torch.testing.assert_close(torch.exp(params["scales"].detach()), 0.25 * sizes)
+    torch.testing.assert_close(torch.sigmoid(params["opacities"].detach()), torch.full((30, 1), 0.4))
+    found = (strategy.cap_max, strategy.refine_start_iter, strategy.refine_stop_iter, strategy.refine_every)
+    assert found == (77, 11, 222, 13)
+    assert not strategy.guarded
+
+
+@pytest.mark.parametrize(("pause", "expected"), [(None, 55), (9, 9), (0, 0)])
+def test_adc_starts_from_the_gaussians_as_they_are_with_splatfactos_fields(pause, expected):
+    params, _ = gaussians(30)
+    before = {name: value.detach().clone() for name, value in params.items()}
+    fields = {"refine_every": 17, "verbose": True, "pause_refine_after_reset": 55}
+    strategy = make_strategy(ModelSettings(strategy="adc", pause_after_reset=pause, guards=False), fields, params)
+    assert isinstance(strategy, AdaptiveDensityControl)
+    assert all(torch.equal(params[name], value) for name, value in before.items())
+    found = (strategy.refine_every, strategy.verbose, strategy.guarded, strategy.pause_refine_after_reset)
+    assert found == (17, False, False, expected)

@@ -23,7 +23,10 @@ from ssa_nerfstudio.plugin.training.nonfinite import (
     SQUARE_LIMIT,
     NonFiniteGuard,
     clamp_scales,
+    finite_points,
     first_nonfinite,
+    mark_for_removal,
+    replace_nonfinite_scales,
 )
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 
@@ -614,3 +617,50 @@ def test_the_guard_never_waits_for_the_device_between_two_checks():
                 optimizer.update(verdict.skipped)
             guard.mask_densification({"radii": torch.ones(1, 3, dtype=torch.int32)})
     assert guard.check(2) == 1
+
+
+def test_seed_points_that_are_not_finite_are_left_out_with_their_colors(caplog):
+    points = torch.tensor([[0.0, 1.0, 2.0], [math.nan, 0.0, 0.0], [3.0, 4.0, math.inf], [5.0, 6.0, 7.0]])
+    colors = torch.arange(12).reshape(4, 3)
+    found = finite_points((points, colors))
+    assert found is not None
+    assert torch.equal(found[0], points[[0, 3]])
+    assert torch.equal(found[1], colors[[0, 3]])
+    bare = finite_points((points, colors[:0]))
+    assert bare is not None
+    assert (bare[0].shape, bare[1].shape) == ((2, 3), (0, 3))
+    assert finite_points(None) is None
+    assert not caplog.text
+    assert finite_points((points[1:3], colors[1:3])) is None
+    assert "no usable 3D points; starting from random ones" in caplog.text
+
+
+def test_seed_points_in_one_place_get_the_usual_scale():
+    scales = torch.tensor([[-3.0, -4.0, -5.0], [-math.inf, math.nan, -4.0], [math.inf, -4.0, -4.0]])
+    replace_nonfinite_scales(scales)
+    assert scales.tolist() == [[-3.0, -4.0, -5.0], [-4.0, -4.0, -4.0], [-4.0, -4.0, -4.0]]
+    lonely = torch.full((2, 3), -math.inf)
+    replace_nonfinite_scales(lonely)
+    torch.testing.assert_close(lonely, torch.full((2, 3), math.log(0.01)))
+
+
+def test_the_first_value_that_is_not_finite_is_named_by_its_place():
+    sound = {"a": torch.ones(2), "b": [1.0, {"c": torch.tensor([1, 2])}, "text", None], "d": (torch.ones(1), 3)}
+    assert first_nonfinite(sound) is None
+    assert first_nonfinite({**sound, "e": [0.0, {"f": torch.tensor([1.0, math.nan])}]}) == "e.1.f"
+    assert first_nonfinite({"x": (1.0, math.inf), "y": math.nan}) == "x.1"
+    assert first_nonfinite(torch.tensor(math.nan), "loss") == "loss"
+
+
+def test_scales_are_clamped_to_their_range():
+    scales = torch.tensor([[-50.0, 0.0, 50.0]])
+    clamp_scales(scales)
+    assert torch.exp(scales.double())[0].tolist() == pytest.approx([1e-8, 1.0, 1e4], rel=1e-5)
+
+
+def test_gaussians_with_any_broken_value_are_made_transparent():
+    params = {"means": torch.zeros(4, 3), "quats": torch.ones(4, 4), "opacities": torch.zeros(4, 1)}
+    params["means"][1, 2], params["quats"][2, 0], params["opacities"][3] = math.nan, math.inf, math.nan
+    broken = mark_for_removal(params)  # pyright: ignore[reportArgumentType]
+    assert broken.tolist() == [False, True, True, True]
+    assert params["opacities"].flatten().tolist() == [0.0, -15.0, -15.0, -15.0]

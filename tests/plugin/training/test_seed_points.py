@@ -7,7 +7,7 @@ import copy
 import pytest
 import torch
 
-from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
+from ssa_nerfstudio.plugin.training.seed_points import color_parameters, nearest_depth, outside_cameras
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 K = torch.tensor([[50.0, 0.0, 32.0], [0.0, 50.0, 24.0], [0.0, 0.0, 1.0]])
@@ -58,3 +58,27 @@ def test_a_blob_before_a_camera_is_not_drawn_and_a_checkpoint_remembers_it(
     del state["near_plane"]  # a checkpoint of before
     model.load_state_dict(state)
     assert float(model.near_plane) == pytest.approx(NEAR_PLANE)
+
+
+def test_only_seed_points_inside_a_camera_are_dropped(caplog):
+    """Nearer than the near plane to any of the cameras, of which there are more than are compared at once."""
+    positions = torch.zeros(130, 3, dtype=torch.float64)
+    positions[:, 0] = torch.arange(130)
+    means = torch.tensor([[0.0, 0.0, 0.009], [0.0, 0.0, 0.011], [129.0, 0.005, 0.0], [64.5, 0.0, 0.0]])
+    assert outside_cameras(means, positions).tolist() == [False, True, False, True]
+    assert not caplog.text
+
+
+def test_a_scene_within_a_camera_keeps_its_points_and_says_so(caplog):
+    assert outside_cameras(torch.zeros(3, 3), torch.zeros(2, 3)).tolist() == [True] * 3
+    assert "every seed point is within 0.01 of a camera" in caplog.text
+    assert "auto-scale-poses True" in caplog.text
+
+
+def test_seed_colors_are_what_is_drawn():
+    colors = torch.tensor([[0, 51, 255], [128, 200, 10]], dtype=torch.uint8)
+    values = colors.double() / 255
+    constant = color_parameters(colors, 3).double()
+    torch.testing.assert_close(0.28209479177387814 * constant + 0.5, values, atol=1e-6, rtol=0)
+    torch.testing.assert_close(torch.sigmoid(color_parameters(colors, 0)).double(), values, atol=2e-6, rtol=0)
+    assert color_parameters(colors, 0).isfinite().all()
