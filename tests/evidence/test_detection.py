@@ -243,3 +243,27 @@ def test_any_frame_and_number_of_views_gives_a_mask_of_its_size(height, width, v
     assert 0 < found.p_value <= 1
     low, high = found.p_interval
     assert 0 <= low < high <= 1
+
+
+@pytest.mark.parametrize(("exceeding", "verdict"), [(0, "faint"), (1, "faint"), (2, "none"), (39, "none")])
+def test_an_artifact_is_reported_at_one_percent(exceeding, verdict, monkeypatch):
+    """1 of 200 shifted captures has as many edges: p = 2 / 201; 2 of 200: more than one percent."""
+    statistics = statistics_of(behind(capture(12), logo(0.4)))
+    draws = [(1.0, 1.0)] * exceeding + [(0.0, 0.0)] * (200 - exceeding)
+    monkeypatch.setattr(detection, "null_shares", lambda *_: iter(draws))
+    found = detect(statistics)
+    assert found.verdict == verdict
+    assert found.p_value == pytest.approx((1 + exceeding) / 201)
+    assert not found.too_few_edges
+
+
+def test_edges_that_shifted_captures_have_as_well_do_not_count(monkeypatch):
+    """Fewer than the capture, so that it is significant, but so many that what is left is too little."""
+    statistics = statistics_of(behind(capture(12), logo(0.4)))
+    shares = detect(statistics).shares
+    draw = tuple(share - 0.9 * least for share, least in zip(shares, edge_evidence.MIN_EDGE_SHARES, strict=True))
+    monkeypatch.setattr(detection, "null_shares", lambda *_: iter([draw] * 200))
+    found = detect(statistics)
+    assert found.verdict == "none"
+    assert found.too_few_edges
+    assert found.null_shares == pytest.approx(draw)
