@@ -39,4 +39,4 @@ def to_rgba8(transmittance: Tensor, addition: Tensor) -> np.ndarray:
         RGBA, uint8 [H, W, 4].
     """
     rgba = torch.cat(straight_color(transmittance, addition), dim=-1)
-    return (rgba.clamp(0.0, 1.0) * 255.0).round().byte().cpu().numpy()
+    return (rgba * 255.0).round().byte().cpu().numpy()

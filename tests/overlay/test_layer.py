@@ -230,3 +230,34 @@ def test_an_oracle_says_its_frame() -> None:
     assert {layer.dtype for layer in overlay.layers()} == {torch.float32}
     clean = random(3, 5, 3)
     torch.testing.assert_close(overlay.composite(clean), clean)
+
+
+def test_an_overlay_starts_from_what_is_given_and_never_so_far_out_that_it_cannot_move() -> None:
+    overlay = ScreenSpaceOverlay(2, 2).double()
+    color = torch.tensor([[[0.2, 0.4, 0.6], [0.0, 1.0, 0.5]], [[0.3, 0.3, 0.3], [1.0, 0.0, 0.0]]], dtype=torch.float64)
+    alpha = torch.tensor([[[0.7], [0.0]], [[1.0], [0.02]]], dtype=torch.float64)
+    evidence = torch.tensor([[[0.1], [0.9]], [[1.0], [0.0]]], dtype=torch.float64)
+    overlay.initialize(color, alpha, evidence)
+    torch.testing.assert_close(overlay.color(), color.clamp(1 / 510, 509 / 510))
+    assert overlay.matte().flatten().tolist() == pytest.approx([0.7, 0.01, 0.99, 0.02])
+    assert torch.equal(overlay.evidence, evidence)
+    assert all(parameter.requires_grad and parameter.is_leaf for parameter in overlay.parameters())
+
+
+def test_logits_that_ran_away_come_back_to_where_a_gradient_moves_them() -> None:
+    overlay = ScreenSpaceOverlay(1, 3).double()
+    with torch.no_grad():
+        overlay.alpha_logits.copy_(torch.tensor([-50.0, 1.0, 50.0]).reshape(1, 3, 1))
+        overlay.color_logits.copy_(torch.tensor([-50.0, 2.0, 50.0]).expand(1, 3, 3))
+    overlay.clamp_logits()
+    assert overlay.alpha_logits.flatten().tolist() == pytest.approx([-12.0, 1.0, math.log(999)])
+    assert overlay.color_logits[0, 0].tolist() == [-12.0, 2.0, 12.0]
+    assert overlay.matte().max().item() == pytest.approx(0.999)
+
+
+@pytest.mark.parametrize("adds_light", [False, True])
+def test_a_camera_of_many_pixels_says_its_size(adds_light: bool) -> None:
+    overlay = ScreenSpaceOverlay(5, 7, 2, adds_light)
+    assert overlay.frame.tolist() == [5, 7, 2, int(adds_light)]
+    assert overlay.frame.dtype == torch.int64
+    assert set(overlay.state_dict()) == {"color_logits", "alpha_logits", "frame", "evidence"}

@@ -193,3 +193,21 @@ def test_a_missing_triton_is_reported_once(monkeypatch: pytest.MonkeyPatch, capl
 
 def test_tritons_kernels_are_the_formula_in_its_interpreter() -> None:
     check_in_tritons_interpreter(INTERPRETED)
+
+
+def test_triton_is_looked_for_by_its_name(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: object() if name == "triton" else None)
+    photometric._triton_available.cache_clear()
+    assert photometric._triton_available()
+    photometric._triton_available.cache_clear()
+    assert not caplog.text
+
+
+def test_devices_without_kernels_compute_in_plain_torch_and_stay_on_the_device() -> None:
+    """The device `meta` stands for any that is neither a CPU nor CUDA."""
+    prediction = torch.zeros(20, 25, 3, device="meta", requires_grad=True)
+    value = photometric_loss(prediction, torch.zeros(20, 25, 3, device="meta"), 0.2)
+    assert (value.device.type, value.shape) == ("meta", ())
+    value.backward()
+    assert prediction.grad is not None
+    assert prediction.grad.shape == (20, 25, 3)

@@ -33,3 +33,21 @@ def test_rgba_is_straight_and_rounded(channels):
     rgba = to_rgba8(transmittance, addition)
     assert rgba.dtype == np.uint8
     np.testing.assert_array_equal(rgba[0], expected)
+
+
+def test_the_board_has_squares_of_eight_pixels_and_the_precision_of_the_colors():
+    clear = torch.zeros(20, 30, 1, dtype=torch.float64)
+    color = torch.rand(20, 30, 3, dtype=torch.float64)
+    assert torch.equal(over_checkerboard(color, clear), over_checkerboard(color, clear, 8))
+    assert set(over_checkerboard(color, clear).unique().tolist()) == {0.35, 0.5}
+
+
+def test_the_board_is_made_where_the_colors_are():
+    """The device `meta` stands for any that is not the CPU."""
+    color, alpha = torch.zeros(20, 30, 3, device="meta"), torch.zeros(20, 30, 1, device="meta")
+    assert over_checkerboard(color, alpha).device.type == "meta"
+
+
+def test_light_beyond_white_is_white_in_eight_bits():
+    rgba = to_rgba8(torch.ones(1, 1, 1), torch.tensor([[[1.7, 0.5, 0.0]]]))
+    assert rgba[0, 0].tolist() == [255, 128, 0, 255]
