@@ -72,3 +72,21 @@ def test_a_truth_of_another_size_is_averaged() -> None:
     scores = layer_errors(flat(0.6)[..., :1], flat((0.1, 0.2, 0.3)), transmitted, added)
     assert scores["transmittance_error"] < 1e-6
     assert scores["premultiplied_error"] < 1e-6
+
+
+@pytest.mark.parametrize("factor", [2, 4, 5])
+def test_no_pixel_of_a_larger_truth_is_skipped(factor: int) -> None:
+    transmitted, added = flat(1.0, 20 * factor, 30 * factor), flat(0.0, 20 * factor, 30 * factor)
+    transmitted[::factor, ::factor], added[::factor, ::factor] = 0.0, 1.0  # one pixel of a block
+    share = 1 / factor**2
+    scores = layer_errors(flat(1.0 - share)[..., :1], flat(share), transmitted, added)
+    assert max(scores[name] for name in ("matte_error", "premultiplied_error", "transmittance_error")) < 1e-6
+
+
+def test_a_pixel_is_artifact_from_half_its_light_on() -> None:
+    """Of four parts of the frame, the truth hides 0.9, 0.3, 0.7 and 0.2 and the learned matte 0.8, 0.3, 0.4, 0.6."""
+    true, learned = flat(1.0, 8, 8), flat(1.0, 8, 8)
+    for k, (truth, found) in enumerate(((0.9, 0.8), (0.3, 0.3), (0.7, 0.4), (0.2, 0.6))):
+        true[2 * k : 2 * k + 2], learned[2 * k : 2 * k + 2] = 1 - truth, 1 - found
+    black = flat(0.0, 8, 8)
+    assert layer_errors(learned[..., :1], black, true, black)["matte_iou"] == pytest.approx(1 / 3)
