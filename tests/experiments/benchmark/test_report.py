@@ -297,3 +297,18 @@ def test_a_folder_without_results_is_refused(tmp_path, content):
     with pytest.raises(InputError):
         report([tmp_path], tmp_path / "report")
     assert not (tmp_path / "report").exists()
+
+
+def test_the_best_of_a_row_has_the_highest_psnr_and_ssim_and_the_lowest_flip():
+    results = all_results()
+    order = ("paper", "default", "given")
+    for k, r in enumerate(results):
+        rank = order.index(r.run.method) if r.run.method in order else 1
+        scores = {"psnr": 20.0 + rank, "ssim": 0.5 + 0.1 * rank, "flip": 0.1 + 0.1 * rank}
+        results[k] = dataclasses.replace(r, metrics={**r.metrics, **scores})
+    (study,) = studies(results)
+    drawn = category_tables.results_by_category(study, with_paper=False)
+    row = next(row for row in drawn.rows if row[0] == "Mud")
+    bold = {heading for heading, cell in zip(drawn.headings, row, strict=True) if "**" in cell}
+    assert {"oracle overlay PSNR ↑", "oracle overlay SSIM ↑", "SSA, paper's rule FLIP ↓"} <= bold
+    assert not {"SSA, paper's rule PSNR ↑", "SSA, paper's rule SSIM ↑", "oracle overlay FLIP ↓"} & bold

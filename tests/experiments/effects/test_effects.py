@@ -249,3 +249,26 @@ def test_only_the_named_effect_is_loaded(effect):
     assert modules & {*EFFECTS} == {effect}
     assert ("albumentations" in loaded) == (effect in ("rain", "mud"))
     assert not {"torch", "nerfstudio"} & {*loaded}
+
+
+def test_vignette_falls_off_smoothly_from_its_start_to_the_corners():
+    """Hermite's step 3 s^2 - 2 s^3: half of the strength half way, a sixth and five sixths near the ends."""
+    matte = drawn(Vignette(strength=0.6, start=0.2), 300, 400).matte
+    y, x = np.mgrid[:300, :400] + 0.5
+    radius = np.hypot(x - 200, y - 150) / 250
+    for s, share in ((0.25, 5 / 32), (0.5, 0.5), (0.75, 27 / 32)):
+        ring = np.abs(radius - (0.2 + 0.8 * s)) < 0.005
+        assert matte[ring].mean() == pytest.approx(0.6 * share, abs=0.003)
+
+
+@pytest.mark.parametrize("drift", [1.0, 3.0])
+def test_occlusion_sways_with_its_standard_deviation(drift):
+    """By how far the mean arm has to be shifted to be each view's."""
+    layers = Occlusion(drift=drift, reach=0.4, blur=0.02).layers(120, 160, rng())
+    views = [layers.view(rng(view)).matte for view in range(150)]
+    mean = np.mean(views, axis=0)
+    # What a shift by one pixel changes, from the mean's gradient, and the shift of each view by least squares.
+    down, right = np.gradient(mean)
+    basis = np.stack([down.ravel(), right.ravel()], axis=1)
+    shifts = np.array([np.linalg.lstsq(basis, (mean - view).ravel(), rcond=None)[0] for view in views])
+    assert shifts.std(axis=0) == pytest.approx(drift, rel=0.2)
