@@ -50,7 +50,7 @@ slow: $(READY)
 	$(PYTEST) -m slow
 
 mutants: $(READY)
-	$(BIN)/python benchmarks/mutants.py --room $(ROOM)
+	$(BIN)/python benchmarks/mutants.py --room $(ROOM) $(if $(SAMPLE),--sample $(SAMPLE)) $(if $(SEED),--seed $(SEED))
 
 stability: $(READY)
 	$(PYTEST) -m "stability or not stability" tests/stability tests/plugin/training/test_nonfinite.py tests/plugin/training/test_checkpoints.py

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import filecmp
 import os
+import random
 import re
-import shutil
 import subprocess
 import sys
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+
+from mutation.undecorated import undecorated
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
@@ -21,10 +22,22 @@ SETTINGS = """
 source_paths = ["ssa_nerfstudio"]
 only_mutate = ["ssa_nerfstudio/{room}/*"]
 pytest_add_cli_args_test_selection = ["tests/{room}"]
-also_copy = ["configs"]
+also_copy = ["configs", "benchmarks"]
 # Forks of a process in which torch and numba have computed hang.
 process_isolation = "forkserver"
+# With the default of a few seconds, most of which tests need to be collected, mutants seem to hang on a busy machine.
+timeout_constant = 30.0
+timeout_multiplier = 4.0
 """
+GENERATE = """
+from mutmut import __main__ as mutmut
+mutmut.makedirs("mutants", exist_ok=True)
+mutmut.copy_src_dir()
+mutmut.copy_also_copy_files()
+mutmut.create_mutants(1)
+"""
+KNOWN = ("killed", "segfault")
+"""Verdicts that stand; others are tried again, because tests may have been added since."""
 
 
 @dataclass
@@ -34,9 +47,13 @@ class Command:
     room: str = "overlay"
     """Folder below ssa_nerfstudio, and below tests: overlay, evidence, plugin/training, ..."""
     output: Path = Path("build/mutants")
-    """Folder to work in. A stopped run continues; mutants of functions that have changed are tried anew."""
+    """Folder to work in. A stopped run continues; survivors and mutants of changed functions are tried anew."""
     children: int = len(os.sched_getaffinity(0))
     """Mutants tried at once."""
+    sample: int = 0
+    """Try so many, drawn at random from all of the folder; 0: all."""
+    seed: int = 0
+    """Of the sample."""
 
     def run(self) -> None:
         """Try what is left, and write OUTPUT/ROOM.md.
@@ -47,48 +64,63 @@ class Command:
         for kind in ("ssa_nerfstudio", "tests"):
             if not (ROOT / kind / self.room).is_dir():
                 raise InputError(f"there is no folder {kind}/{self.room}", "name one below both")
-        folder = self.output / self.room
+        folder = self.output.resolve() / self.room
         _copy(folder, self.room)
-        mutmut = [sys.executable, "-m", "mutmut"]
-        environment = {**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-        tried = subprocess.run([*mutmut, "run", "--max-children", str(self.children)], cwd=folder, env=environment)
-        if tried.returncode:
-            raise InputError(f"the tests of {self.room} fail as they are", f"pytest tests/{self.room} says why")
+        copy = folder / "mutants"
+        # What is tested comes before what is installed, also in processes that tests start.
+        environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 
         def told(*words: str) -> str:
-            return subprocess.run([*mutmut, *words], cwd=folder, capture_output=True, text=True, check=True).stdout
+            command = [sys.executable, "-m", "mutmut", *words]
+            return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
 
-        found = dict(re.findall(r"^ +(\S+): (.+)$", told("results", "--all", "true"), re.MULTILINE))
+        def found() -> dict[str, str]:
+            return dict(re.findall(r"^ +(\S+): (.+)$", told("results", "--all", "true"), re.MULTILINE))
+
+        subprocess.run([sys.executable, "-c", GENERATE], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        before = found()
+        names = sorted(before)
+        if self.sample:
+            names = random.Random(self.seed).sample(names, min(self.sample, len(names)))
+        todo = [name for name in names if before[name] not in KNOWN]
+        if todo:
+            command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(self.children), *todo]
+            if subprocess.run(command, cwd=folder, env=environment).returncode:
+                raise InputError(f"the tests of {self.room} fail as they are", f"pytest tests/{self.room} says why")
+        after = found()
+        tried = {name: after[name] for name in names}
+        changes = {name: told("show", name) for name, status in tried.items() if status in ("survived", "timeout")}
         page = self.output / f"{self.room.replace('/', '-')}.md"
-        page.write_text(_page(self.room, found, {name: told("show", name) for name in _survivors(found)}))
+        drawn = f" SAMPLE={self.sample} SEED={self.seed}" if self.sample else ""
+        page.write_text(_page(f"{self.room}{drawn}", tried, changes))
         print(page)
-
-
-def _survivors(found: dict[str, str]) -> list[str]:
-    return [name for name, status in found.items() if status == "survived"]
 
 
 def _copy(folder: Path, room: str) -> None:
     """Copy what has changed, so that what was tried stays known."""
-    for kind in ("ssa_nerfstudio", "configs", "tests"):
+    for kind in ("ssa_nerfstudio", "configs", "tests", "benchmarks"):
         for path in (ROOT / kind).rglob("*"):
             place = folder / path.relative_to(ROOT)
             if path.is_file() and "__pycache__" not in path.parts:
+                content = path.read_bytes()
+                if path.is_relative_to(ROOT / "ssa_nerfstudio" / room) and path.suffix == ".py":
+                    content = undecorated(content.decode()).encode()
                 place.parent.mkdir(parents=True, exist_ok=True)
-                if not place.exists() or not filecmp.cmp(path, place, shallow=False):
-                    shutil.copy(path, place)
+                if not place.exists() or place.read_bytes() != content:
+                    place.write_bytes(content)
     settings = (ROOT / "pyproject.toml").read_text() + SETTINGS.format(room=room)
     (folder / "pyproject.toml").write_text(settings)
 
 
 def _page(room: str, found: dict[str, str], changes: dict[str, str]) -> str:
     counts = Counter(found.values())
-    noticed, reached = counts["killed"] + counts["timeout"], len(found) - counts["no tests"]
+    noticed, reached = counts["killed"] + counts["timeout"] + counts["segfault"], len(found) - counts["no tests"]
     lines = [
         f"# Mutants of {room}",
-        f"`make mutants ROOM={room}`: {noticed} of {reached} noticed ({noticed / max(1, reached):.1%}); "
-        f"{counts['no tests']} in functions that no test of the folder calls on this machine.",
-        *(f"## {name}\n\n```diff\n{change.strip()}\n```" for name, change in changes.items()),
+        f"`make mutants ROOM={room}`: {noticed} of {reached} noticed ({noticed / max(1, reached):.1%}), "
+        f"{counts['timeout']} of them by running out of time; {counts['no tests']} more are in functions that no test "
+        "of the folder calls on this machine.",
+        *(f"## {name}: {found[name]}\n\n```diff\n{change.strip()}\n```" for name, change in changes.items()),
     ]
     return "\n\n".join(lines) + "\n"
 
