@@ -267,3 +267,13 @@ def test_edges_that_shifted_captures_have_as_well_do_not_count(monkeypatch):
     assert found.verdict == "none"
     assert found.too_few_edges
     assert found.null_shares == pytest.approx(draw)
+
+
+@pytest.mark.parametrize(("views", "tested"), [(5, False), (6, True)])
+def test_six_views_are_enough_to_say_something(views, tested):
+    found = detect(statistics_of(behind(capture(views), board())), draws=100)
+    assert (found.p_value < 1) == tested
+    assert found.views == views
+    assert max(found.shares) > 0
+    assert not found.opaque[:60].any()
+    assert bool(found.mask.any()) == (found.verdict != "none")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ssa_nerfstudio.evidence.guided_upsampling import local_mean, reduced, upsample
+from ssa_nerfstudio.evidence.guided_upsampling import enlarged, local_mean, reduced, upsample
 
 
 @pytest.mark.parametrize("size", [(24, 32), (27, 34)])
@@ -32,3 +32,28 @@ def test_local_means_are_means_of_what_is_in_the_frame() -> None:
     values = torch.arange(12.0).reshape(3, 4, 1)
     assert float(local_mean(values, 1)[0, 0]) == pytest.approx((0 + 1 + 4 + 5) / 4)
     assert float(local_mean(values, 9)[2, 3]) == pytest.approx(5.5)
+
+
+def test_enlarging_keeps_places_and_repeats_the_last_pixels() -> None:
+    """A ramp over pixel centers stays one, in every one of its further dimensions."""
+    values = torch.arange(5.0)[None, :, None, None].expand(3, 5, 2, 2) * torch.tensor([[1.0, 2.0], [3.0, -1.0]])
+    found = enlarged(values, 7, 12, 2)
+    assert found.shape == (7, 12, 2, 2)
+    places = ((torch.arange(12.0) + 0.5) / 2 - 0.5).clamp(0, 4)
+    torch.testing.assert_close(found[3, :, 1, 0], 3 * places)
+    torch.testing.assert_close(found[6, :, 0, 1], 2 * places)
+    assert torch.equal(found[:, 11], found[:, 9])
+
+
+def test_reducing_averages_squares_and_drops_the_rest() -> None:
+    image = torch.arange(7.0 * 8 * 2).reshape(7, 8, 2)
+    found = reduced(image, 3)
+    assert found.shape == (2, 2, 2)
+    torch.testing.assert_close(found[1, 0], image[3:6, :3].mean(dim=(0, 1)))
+
+
+def test_local_means_keep_further_dimensions_apart() -> None:
+    values = torch.rand(5, 6, 2, 3, generator=torch.Generator().manual_seed(0))
+    found = local_mean(values, 2)
+    torch.testing.assert_close(found[2, 3, 1, 2], values[:, 1:6, 1, 2].mean())
+    torch.testing.assert_close(found[0, 0], values[:3, :3].mean(dim=(0, 1)))
