@@ -21,7 +21,8 @@ SETTINGS = """
 [tool.mutmut]
 source_paths = ["ssa_nerfstudio"]
 only_mutate = ["ssa_nerfstudio/{room}/*"]
-pytest_add_cli_args_test_selection = ["tests/{room}"]
+# The seconds that a test of speed takes say nothing about a mutant.
+pytest_add_cli_args_test_selection = ["tests/{room}", "-k", "not speed"]
 also_copy = ["configs", "benchmarks"]
 # Forks of a process in which torch and numba have computed hang.
 process_isolation = "forkserver"
@@ -36,7 +37,8 @@ mutmut.copy_src_dir()
 mutmut.copy_also_copy_files()
 mutmut.create_mutants(1)
 """
-KNOWN = ("killed", "segfault")
+NOTICED = ("killed", "timeout", "segfault", "suspicious")  # the last: any other exit code, such as that of an abort
+KNOWN = ("killed", "segfault", "suspicious")
 """Verdicts that stand; others are tried again, because tests may have been added since."""
 
 
@@ -114,7 +116,7 @@ def _copy(folder: Path, room: str) -> None:
 
 def _page(room: str, found: dict[str, str], changes: dict[str, str]) -> str:
     counts = Counter(found.values())
-    noticed, reached = counts["killed"] + counts["timeout"] + counts["segfault"], len(found) - counts["no tests"]
+    noticed, reached = sum(counts[status] for status in NOTICED), len(found) - counts["no tests"]
     lines = [
         f"# Mutants of {room}",
         f"`make mutants ROOM={room}`: {noticed} of {reached} noticed ({noticed / max(1, reached):.1%}), "

@@ -1,4 +1,4 @@
-"""Decorated functions in a form that mutmut changes: it leaves every function with a decorator as it is."""
+"""Functions in a form that mutmut changes: it leaves those with a decorator, and what an import calls, as they are."""
 
 from __future__ import annotations
 
@@ -10,17 +10,24 @@ _KERNEL = "__import__('benchmarks.mutation.kernels', fromlist=['Kernel']).Kernel
 
 
 def undecorated(source: str) -> str:
-    """Apply decorators in a statement after each function, and compile numba's kernels when they are first called.
+    """Apply decorators in a statement after each function, and let every call make what is made when a module is read.
 
-    `@a @b def f(): ...` becomes `def f(): ...` and `f = a(b(f))`, which is what decorators mean. A kernel becomes a
-    `kernels.Kernel`, because numba compiles no function that chooses a mutant.
+    `@a @b def f(): ...` becomes `def f(): ...` and `f = a(b(f))`, which is what decorators mean. A kernel of numba's
+    becomes a `kernels.Kernel`, because numba compiles no function that chooses a mutant. `f = make_f(...)` becomes a
+    function that calls `make_f(...)(...)`: modules are read before a mutant is chosen.
 
     Args:
         source: of a module.
     """
     lines = source.splitlines()
-    functions = [node for node in _functions(ast.parse(source)) if node.decorator_list]
-    for function in reversed(functions):
+    module = ast.parse(source)
+    for node in module.body:
+        match node:
+            case ast.Assign([ast.Name(name)], ast.Call(ast.Name(maker))) if maker.startswith("make_"):
+                assert node.lineno == node.end_lineno
+                call = ast.unparse(node.value)
+                lines[node.lineno - 1] = f"def {name}(*given, **named): return {call}(*given, **named)"
+    for function in reversed([node for node in _functions(module) if node.decorator_list]):
         decorators = [ast.unparse(decorator) for decorator in function.decorator_list]
         names = [decorator.partition("(")[0] for decorator in decorators]
         if decorators in (["staticmethod"], ["classmethod"]) or any(name.endswith(_AS_THEY_ARE) for name in names):

@@ -95,3 +95,11 @@ def test_kernels_are_compiled_later_and_what_only_numba_calls_stays_as_it_is():
 def test_a_module_without_decorators_is_left_alone():
     source = "def f():\n    return 1\n"
     assert undecorated(source) == source
+
+
+def test_what_is_made_when_a_module_is_read_is_made_at_every_call():
+    source = "made = []\n\n\ndef make_sum(x):\n    made.append(x)\n    return lambda y: x + y\n\n\nplus = make_sum(2)\n"
+    names = run(undecorated(source))
+    assert names["made"] == []
+    assert [names["plus"](3), names["plus"](y=4)] == [5, 6]
+    assert names["made"] == [2, 2]

@@ -182,7 +182,11 @@ clear, dark = torch.ones(4, 5, 3), torch.zeros(4, 5, 3)
         (clear[..., :1], dark[..., :1], "must both be"),
         (clear[0], dark[0], "must both be"),
         (clear, dark[:3], r"they are \(4, 5, 3\) and \(3, 5, 3\)"),
-        (clear.clone().index_fill_(0, torch.tensor(1), float("nan")), dark, "not finite"),
+        (
+            clear.clone().index_fill_(0, torch.tensor(1), float("nan")),
+            dark,
+            "^T or B holds values that are not finite$",
+        ),
         (clear, dark.clone().index_fill_(0, torch.tensor(1), float("inf")), "not finite"),
         (1.001 * clear, dark, "T must lie in"),
         (clear - 1.001, dark, "T must lie in"),
