@@ -260,3 +260,38 @@ assert before["blend_bands"] == before["project_gaussians"] == 1, before
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+def one_gaussian(
+    x: float, y: float, opacity: float = 0.5
+) -> tuple[dict[str, torch.Tensor], torch.Tensor, torch.Tensor]:
+    """A small Gaussian on the optical axis, and a camera whose axis meets the image, of 20 x 20 pixels, at (x, y)."""
+    gaussians, viewmats, Ks = scene(1, 20, 20, size=0.05, sh_degree=None)
+    gaussians["means"] = torch.tensor([[0.0, 0.0, 3.0]], dtype=torch.float64)
+    gaussians["opacities"] = torch.tensor([opacity], dtype=torch.float64)
+    Ks[0, 0, 2], Ks[0, 1, 2] = x, y
+    return gaussians, viewmats, Ks
+
+
+def drawn_radius(name: str, x: float, y: float) -> int:
+    gaussians, viewmats, Ks = one_gaussian(x, y)
+    return int(BODIES[name](**gaussians, viewmats=viewmats, Ks=Ks, width=20, height=20)[2]["radii"].item())
+
+
+@every_body
+def test_a_splat_whose_square_only_touches_the_frame_is_not_drawn(name: str) -> None:
+    radius = drawn_radius(name, 10, 10)
+    assert radius > 0
+    for x, y in ((-radius, 10), (20 + radius, 10), (10, -radius), (10, 20 + radius)):
+        assert drawn_radius(name, x, y) == 0
+    for x, y in ((1e-6 - radius, 10), (20 + radius - 1e-6, 10), (10, 1e-6 - radius), (10, 20 + radius - 1e-6)):
+        assert drawn_radius(name, x, y) == radius
+
+
+@every_body
+@pytest.mark.parametrize(("opacity", "drawn"), [(1 / 255, True), (1 / 255 - 1e-12, False)])
+def test_what_reaches_a_255th_is_drawn(name: str, opacity: float, drawn: bool) -> None:
+    gaussians, viewmats, Ks = one_gaussian(8.5, 11.5, opacity)
+    alpha = BODIES[name](**gaussians, viewmats=viewmats, Ks=Ks, width=20, height=20)[1][0, ..., 0]
+    assert (alpha > 0).sum() == drawn
+    assert alpha[11, 8].item() == pytest.approx(opacity if drawn else 0, abs=1e-12)
