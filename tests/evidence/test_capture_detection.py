@@ -15,6 +15,7 @@ from conftest import edit_transforms
 from PIL import Image
 
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.evidence.capture_detection import read_cameras
 
 
 def photos(folder: Path, count: int = 14, artifact: bool = True, size: tuple[int, int] = (64, 96)) -> Path:
@@ -195,3 +196,9 @@ def test_a_full_disk_leaves_nothing(plain, largest, tmp_path):
     (line,) = done.stderr.splitlines()
     assert f"found{'.json' * plain} cannot be written" in line
     assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+def test_a_dataset_may_be_named_by_its_file(tiny_scene):
+    of_folder, of_file = (read_cameras(path, 10) for path in (tiny_scene, tiny_scene / "transforms.json"))
+    assert [(camera.name, camera.count) for camera in of_file] == [(camera.name, camera.count) for camera in of_folder]
+    assert [camera.count for camera in of_file] == [12]

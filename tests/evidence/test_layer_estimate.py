@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.layer_estimate import estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import SMOOTHNESS_FLOOR, _smoothness, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
 HEIGHT, WIDTH = 36, 48
@@ -120,3 +120,17 @@ def test_any_number_of_samples_gives_finite_layers(seed: int) -> None:
             assert torch.isfinite(layer).all()
             assert layer.min() >= 0
             assert layer.max() <= 1
+
+
+def test_layers_may_differ_between_neighbors_as_much_as_the_photos_do_there() -> None:
+    """From left to right: nothing differs; the mean does, by half of white in one channel; the deviation doubles."""
+    mean, deviation = torch.full((3, 4, 3), 0.2), torch.full((3, 4, 1), 0.1)
+    mean[:, 2:, 1] = 0.7
+    deviation[:, 3:] = 0.2
+    precision = _smoothness(mean, deviation, 1)
+    assert precision.shape == (3, 3, 4)
+    floor = SMOOTHNESS_FLOOR**2
+    torch.testing.assert_close(precision[0, 0], torch.full((4,), 1 / floor))
+    torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + 0.25)))
+    torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + 1), *[1 / floor] * 3]))
+    assert (_smoothness(mean, deviation, 0) == 1 / floor).all()
