@@ -20,7 +20,8 @@ def camera_names(photos: Sequence[Sequence[str]]) -> list[str]:
     """
     if len(photos) == 1:
         return ["camera_0"]
-    for names in ([_folder(each) for each in photos], [_first_words(each) for each in photos]):
+    for name in (_folder, _before_number, _first_words):
+        names = [name(each) for each in photos]
         if all(names) and len({*names}) == len(names):
             return names
     return [f"camera_{number}" for number in range(len(photos))]
@@ -30,6 +31,12 @@ def _folder(photos: Sequence[str]) -> str:
     """Folder of all photos below the dataset's images/ or images_2/; empty where there is none."""
     folders = {"_".join(PurePosixPath(photo).parts[1:-1]) for photo in photos}
     return folders.pop() if len(folders) == 1 else ""
+
+
+def _before_number(photos: Sequence[str]) -> str:
+    """What all file names have before the number that counts the photos; empty where they differ."""
+    beginnings = {re.sub(r"[_\-. ]*\d+$", "", PurePosixPath(photo).stem) for photo in photos}
+    return beginnings.pop() if len(beginnings) == 1 else ""
 
 
 def _first_words(photos: Sequence[str]) -> str:

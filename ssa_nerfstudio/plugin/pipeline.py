@@ -87,7 +87,8 @@ class SSAPipeline(VanillaPipeline):
         # Undistorts and crops the photos and rewrites the cameras: overlays and depths are of the undistorted frame.
         photos = self.datamanager.cached_train
         if self.config.artifacts_of is None:
-            check_masks(photos, group_cameras(self.datamanager.train_dataset.cameras)[1])
+            dataset = self.datamanager.train_dataset
+            check_masks(photos, group_cameras(dataset.cameras)[1], self.datamanager.photo_names(dataset))
         samples = self._start_exposure()
         self._set_overlays(photos, lenses)
         if self.model.exposure is not None and samples is not None and len(self.model.artifacts):

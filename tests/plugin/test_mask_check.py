@@ -14,6 +14,8 @@ from small_captures import HEIGHT, WIDTH
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.mask_check import check_masks
 
+NAMES = [f"images/{name}_{number:05d}.png" for name in ("front", "side") for number in range(24)]
+
 
 def views(pictures: list[np.ndarray], masks: list[np.ndarray]) -> list[dict]:
     """As the datamanager caches them."""
@@ -28,10 +30,10 @@ def test_a_cameras_own_mask_is_compared_with_its_own_artifact(draw_effect, photo
     pictures = [*(layers.apply(photo) for photo in photos(24)), *photos(24)]
     good = views(pictures, [~there] * 24 + [there] * 24)
     with caplog.at_level(logging.WARNING):
-        check_masks(good, [0] * 24 + [1] * 24)
+        check_masks(good, [0] * 24 + [1] * 24, NAMES)
     assert not caplog.records
-    with pytest.raises(InputError, match=r"the mask of camera 1 keeps 2\d% .* artifact"):
-        check_masks(views(pictures, [there] * 48), [0] * 24 + [1] * 24)
+    with pytest.raises(InputError, match=r"the mask of front keeps 2\d% .* artifact"):
+        check_masks(views(pictures, [there] * 48), [0] * 24 + [1] * 24, NAMES)
 
 
 def test_masks_that_keep_nearly_nothing(photos, caplog):
@@ -39,12 +41,12 @@ def test_masks_that_keep_nearly_nothing(photos, caplog):
     pictures = photos(8)
     nothing = np.zeros((HEIGHT, WIDTH), dtype=bool)
     with pytest.raises(InputError, match=r"the mask keeps 0.0% of the frame; invert the masks: black is ignored"):
-        check_masks(views(pictures, [nothing] * 8), [0] * 8)
+        check_masks(views(pictures, [nothing] * 8), [0] * 8, NAMES[:8])
     different = [nothing.copy() for _ in pictures]
     for number, mask in enumerate(different):
         mask[number, : number + 1] = True
     with caplog.at_level(logging.WARNING):
-        check_masks(views(pictures, different), [0] * 8)
+        check_masks(views(pictures, different), [0] * 8, NAMES[:8])
     (record,) = caplog.records
     assert "keeps 0.0% of the frame" in record.message
 
