@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,6 +14,8 @@ from ssa_nerfstudio.cameras.projections import FaceName, Projection
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
+
+_LOG = logging.getLogger(__name__)
 
 _LOOKED_AT = 5
 """Photos, or frames of videos, that are looked at."""
@@ -52,6 +55,11 @@ def with_faces(
         if projection == "equirectangular" or (projection == "auto" and twice and wraps_around(source)):
             faces.append(panorama_faces(source.width, left_out))
         else:
+            if projection == "auto" and twice:
+                _LOG.warning(
+                    f"the 2:1 photos of {source.path} are taken for perspective ones: their edges do not continue each "
+                    "other, or the poles are no single color (--projection equirectangular cuts them into faces)"
+                )
             faces.append(())
     if left_out and not any(faces):
         raise InputError(

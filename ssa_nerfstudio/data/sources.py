@@ -158,7 +158,7 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
             )
         raise InputError(
             f"{photo} is {other[0][0]} x {other[0][1]}, {photos[0].name} is {size[0]} x {size[1]}",
-            "use one folder for each camera and orientation",
+            f"use one folder for each camera and orientation, or remove the {len(groups[other])} photos like it",
         )
     return _of_photos(name, path, photos, (size, orientation), videos)
 
