@@ -21,7 +21,7 @@ DEMO := outputs/demo
 # The built-in scene is small: every pixel from the start, and fewer new Gaussians than photos of megapixels need.
 DEMO_OPTIONS ?= $(if $(DATA),,--steps 800 --train.pipeline.model.num-downscales 0 --train.pipeline.model.densify-grad-thresh 0.006)
 
-# Two workers, on two cores: libraries that start a thread a core take twice as long, for what they wait for each other.
+# One thread a library: two workers whose libraries start a thread a core take twice as long on two cores.
 PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .PHONY: setup demo docs test slow mutants stability lint bare format clean
@@ -38,7 +38,7 @@ $(READY): pyproject.toml Makefile
 
 demo: $(READY)
 	@test -n "$(DATA)" -o -d $(DEMO)/dashboard || $(BIN)/ssa simulate --effects dashboard --output $(DEMO)/dashboard
-	$(BIN)/ssa run "$(or $(DATA),$(DEMO)/dashboard)" --output "$(DEMO)/run$(if $(DATA),-$(notdir $(DATA)))" $(DEMO_OPTIONS)
+	$(BIN)/ssa run "$(or $(DATA),$(DEMO)/dashboard)" --output "$(DEMO)/run$(if $(DATA),-$(notdir $(DATA:/=)))" $(DEMO_OPTIONS)
 
 docs: $(READY)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -W ignore -m mkdocs build --strict

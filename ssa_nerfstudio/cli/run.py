@@ -52,7 +52,13 @@ class Command:
         """
         own, forwarded = arguments.split_forwarded(options, STAGES)
         _, _, forwarding = (inspect.getdoc(cls) or "").partition("\n\n")
-        command = arguments.read(cls, own, program, f"{description}\n\n{forwarding}")
+        try:
+            command = arguments.read(cls, own, program, f"{description}\n\n{forwarding}")
+        except InputError as error:
+            if "Unrecognized options" not in error.problem:
+                raise
+            stages = ", ".join(f"--{stage}.NAME" for stage in STAGES)
+            raise InputError(error.problem, f"options of its stages are given as {stages}") from error
         command.forwarded = forwarded
         return command
 

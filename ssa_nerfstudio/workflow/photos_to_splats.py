@@ -6,6 +6,7 @@ The stages run in one process, except for structure from motion, whose library d
 from __future__ import annotations
 
 import gc
+import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -20,6 +21,7 @@ import torch
 from PIL import Image
 
 from ssa_nerfstudio._system.name_list import name_list
+from ssa_nerfstudio.cameras.intervals import BEGINNING
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
@@ -41,8 +43,12 @@ from ssa_nerfstudio.workflow.stages import Result, Stage
 
 DETECTION, DATASET, TRAINING, EVALUATION = "detection", "dataset", "training", "evaluation"
 """Folders of a run, one for each of the first four stages."""
+VERDICTS = "detection.json"
+"""File in the first of them."""
 RECORD = "run.json"
 """File of the finished stages."""
+_MIN_MATTE, _MIN_COVERED = 0.3, 0.001
+"""An overlay whose matte exceeds the first in less than the second of the frame is nearly clear."""
 SPLATS, COMPRESSED = "splats.ply", "splats-compressed.ply"
 
 
@@ -108,7 +114,7 @@ def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
     found = plan.detect(on_progress)
     with _emptied(plan.output / DETECTION) as staged:
         write_detections(staged, found)
-        (staged / "detection.json").write_text(detections_to_json(found), encoding="utf-8")
+        (staged / VERDICTS).write_text(detections_to_json(found), encoding="utf-8")
     sentences = [f"{name}: {verdict_in_words(detection)}" for name, detection in found.items()]
     bare = [detection for detection in found.values() if detection.verdict == "none"]
     missed = "a soft artifact has no edges; training looks again, with the scene's points, and says what it found"
@@ -138,11 +144,37 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     _free_memory()
     checkpoint = Checkpoint.read(config_file(plan.training))
     layers = _layers(checkpoint)
-    overlays, kind = len(layers), "intervals" if any("interval" in layer.name for layer in layers) else "cameras"
+    overlays, kind = len(layers), "intervals" if any(layer.start != BEGINNING for layer in layers) else "cameras"
     decided = {0: "the scene alone was learned", 1: "the artifact was learned with the scene"}
     text = decided.get(overlays, f"the artifacts of {overlays} {kind} were learned with the scene")
     resumed = f" (continued at step {began:,})" if began else ""
-    return Result(f"{text}, in {checkpoint.step + 1:,} steps{resumed}", plan.training_warnings)
+    return Result(
+        f"{text}, in {checkpoint.step + 1:,} steps{resumed}", (*plan.training_warnings, *missed_artifacts(plan, layers))
+    )
+
+
+def missed_artifacts(plan: Plan, layers: Sequence[ArtifactLayers]) -> list[str]:
+    """What detection found and the training has not learned, by the number of cameras: names may differ.
+
+    Training tests its own photos, which are fewer than those of the first stage.
+    """
+    groups = json.loads((plan.output / DETECTION / VERDICTS).read_text(encoding="utf-8"))["groups"]
+    found = [group["name"] for group in groups if group["verdict"] != "none"]
+    clear = [layer.name for layer in layers if (layer.straight()[1] > _MIN_MATTE).mean() < _MIN_COVERED]
+    warnings = []
+    # 360 degree photos are one camera for detection and up to six for training.
+    if len(found) > len({layer.name for layer in layers}) and plan.training.pipeline.model.overlay != "off":
+        warnings.append(
+            f"detection found an artifact in the photos of {name_list(found)}, the training in those of "
+            f"{name_list([layer.name for layer in layers]) or 'none'}; if one is left in the splats, run with "
+            "--train.pipeline.model.overlay on and another --output"
+        )
+    if clear:
+        warnings.append(
+            f"the overlay of {name_list(clear)} is nearly clear: what was found there may be left in the splats; look "
+            "at them, and add photos from other places"
+        )
+    return warnings
 
 
 def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:

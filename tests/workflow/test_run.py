@@ -177,6 +177,10 @@ def test_the_page_fits_a_narrow_window_and_its_line_can_be_moved(finished):
         (["--train.pipeline.model.overlay", "maybe"], "(ns-train ssa-splatfacto --help)"),
         (["--train.no-such-option", "1"], "Unrecognized options: --no-such-option"),
         (["--nonsense", "1"], "Unrecognized options: --nonsense"),
+        (
+            ["--pipeline.model.overlay", "on"],
+            "given as --detect.NAME, --process.NAME, --train.NAME",
+        ),
         (["--process.matching", "sequential"], "--process.matching: "),
     ],
 )
