@@ -45,7 +45,7 @@ def command(name: str, *options: str | Path) -> subprocess.CompletedProcess:
 
 @pytest.fixture
 def call(monkeypatch):
-    """Call what a command's script calls. A process of its own imports for ten seconds (`test_as_processes`)."""
+    """Call what a command's script calls. A process of its own imports for ten seconds (`test_eval_render_and_export_as_processes_of_their_own`)."""
 
     def run(name: str, *options: str | Path) -> None:
         (script,) = entry_points(group="console_scripts", name=name)
@@ -187,7 +187,7 @@ def test_the_exported_splats_are_the_checkpoints_and_nothing_of_the_overlay(conf
 
 
 @pytest.mark.slow
-def test_as_processes(config, tmp_path):
+def test_eval_render_and_export_as_processes_of_their_own(config, tmp_path):
     run = ("--load-config", config)
     command("ns-eval", *run, "--output-path", tmp_path / "eval.json")
     command("ns-render", "dataset", *run, "--output-path", tmp_path / "renders", "--rendered-output-names", "composite")
