@@ -45,7 +45,7 @@ def command(name: str, *options: str | Path) -> subprocess.CompletedProcess:
 
 @pytest.fixture
 def call(monkeypatch):
-    """Call what a command's script calls. A process of its own imports for ten seconds (`test_eval_render_and_export_as_processes_of_their_own`)."""
+    """Call what a command's script calls: as a process of its own it imports for ten seconds (a slow test below)."""
 
     def run(name: str, *options: str | Path) -> None:
         (script,) = entry_points(group="console_scripts", name=name)
