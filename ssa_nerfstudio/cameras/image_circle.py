@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import NamedTuple
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -14,6 +14,10 @@ _CORNER = 0.03
 _MAX_RESIDUAL = 0.02
 """Median distance of the border from the circle, relative to its radius, up to which it is one."""
 _FITS = 5
+_PHOTOS = 16
+"""Photos in which a circle is looked for: more show no more of its border."""
+
+_Photo = TypeVar("_Photo")
 
 
 class Circle(NamedTuple):
@@ -27,6 +31,11 @@ class Circle(NamedTuple):
         """Share of each pixel that lies inside, with an edge of one pixel: float32 [height, width]."""
         y, x = np.mgrid[:height, :width] + 0.5
         return (self.radius - np.hypot(x - self.x, y - self.y) + 0.5).clip(0, 1).astype(np.float32)
+
+
+def sampled(photos: Sequence[_Photo]) -> Sequence[_Photo]:
+    """At most 16 of a camera's photos, at least 1, or of what names them: evenly spaced."""
+    return photos[:: -(-len(photos) // _PHOTOS)]
 
 
 def brightest(photos: Iterable[np.ndarray]) -> np.ndarray:

@@ -77,8 +77,6 @@ def read_existing_model(path: Path, photos: Path, sources: Sequence[Source]) -> 
     model = _load(folder)
     if any(source.videos for source in sources):
         raise InputError(f"{photos} holds videos, {path} has the poses of photos", "give the photos it was made from")
-    if any(len(source.cameras) > 1 for source in sources):
-        raise InputError(f"{photos} holds panoramas, {path} has the poses of photos", "leave out --colmap")
     names = {(photos / image.name).resolve(): image for image in model.images.values() if image.has_pose}
     present = {file: names[file.resolve()] for s in sources for file in s.photos if file.resolve() in names}
     if len(present) < 2:

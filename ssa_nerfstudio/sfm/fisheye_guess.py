@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ssa_nerfstudio.cameras.image_circle import brightest, image_circle
+from ssa_nerfstudio.cameras.image_circle import brightest, image_circle, sampled
 from ssa_nerfstudio.data.photos import read_photo
 
-_PHOTOS = 16
 _FRAME_ANGLE = 130.0
 """Degrees that the longer side of a frame without an image circle is taken for: action cameras have 110 to 150."""
 
@@ -24,7 +23,7 @@ def fisheye_guess(photos: Sequence[Path]) -> list[float]:
     Raises:
         InputError: a photo cannot be decoded.
     """
-    peak = brightest(read_photo(path) for path in photos[:: -(-len(photos) // _PHOTOS)])
+    peak = brightest(read_photo(path) for path in sampled(photos))
     circle, (height, width) = image_circle(peak), peak.shape
     if circle is not None:
         focal, middle = circle.radius / (np.pi / 2), (circle.x, circle.y)

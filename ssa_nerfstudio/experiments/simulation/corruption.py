@@ -10,7 +10,7 @@ import numpy as np
 
 from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.groups import group_frames
-from ssa_nerfstudio.cameras.image_circle import Circle, brightest, image_circle
+from ssa_nerfstudio.cameras.image_circle import Circle, brightest, image_circle, sampled
 from ssa_nerfstudio.cameras.lens import Lens, undistort, undistorted_lens
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.photos import write_photo
@@ -19,9 +19,6 @@ from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation.exposure_variation import acts_on_artifact, draw_exposures, expose
 from ssa_nerfstudio.experiments.simulation.layer_files import add_layers, write_view
 from ssa_nerfstudio.experiments.simulation.scene import Scene
-
-_PHOTOS = 16
-"""Photos in which an image circle is looked for."""
 
 
 def corrupt(dataset: Dataset, scene: Scene, names: dict[str, str], folder: Path, threads: int) -> Iterator[None]:
@@ -112,7 +109,7 @@ def _image_circle(dataset: Dataset, views: list[View]) -> Circle | None:
     """The image circle of a fisheye camera's photos; None where they have none."""
     if views[0].lens.model != "fisheye":
         return None
-    return image_circle(brightest(dataset.read_photo(view) for view in views[:: -(-len(views) // _PHOTOS)]))
+    return image_circle(brightest(dataset.read_photo(view) for view in sampled(views)))
 
 
 def _first_views(views: list[View]) -> list[View]:
