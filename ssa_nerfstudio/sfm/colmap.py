@@ -18,6 +18,7 @@ import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, sa
 import pycolmap
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio.sfm.held_lens import MIN_REGISTERED, map_with_held_lens, most_registered
 from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
 from ssa_nerfstudio.sfm.known_poses import align, triangulate
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
@@ -114,14 +115,6 @@ class StructureFromMotion:
             poses: those that are known; those that agree with the photos are where the mapping starts.
         """
         total = sum(len(each.photos) for each in self._passes)
-        options = pycolmap.IncrementalPipelineOptions()
-        options.num_threads = self._settings.threads
-        options.random_seed = 0
-        # COLMAP's default would drop the complete model of a capture of few photos.
-        options.min_model_size = min(10, max(3, total // 2))
-        # What is known stays as it is.
-        options.constant_cameras = {number for number, each in enumerate(self._passes, 1) if each.mount is not None}
-        options.ba_refine_sensor_from_rig = False
         models = self._folder / "models"
         for earlier in (models, self._folder / MODEL):
             shutil.rmtree(earlier, ignore_errors=True)
@@ -139,17 +132,42 @@ class StructureFromMotion:
 
         on_progress("poses", 0, total)
         found = pycolmap.incremental_mapping(
-            *(self._database, self._images, models, options),
+            *(self._database, self._images, models, self._mapping_options(total)),
             input_path=start if kept else "",
             next_image_callback=on_registered,
         )
-        if found:
-            model = max(found.values(), key=lambda model: model.num_reg_images())
+        model = most_registered(found)
+        free = [number for number, each in enumerate(self._passes, 1) if each.mount is None]
+        if not kept and free and (model is None or model.num_reg_images() < MIN_REGISTERED * total):
+            guessed = [number for number in free if not self._is_lens_known(number)]
+            other = map_with_held_lens(
+                *(self._database, self._images, models / "held", lambda: self._mapping_options(total)),
+                *(guessed, model, lambda: on_progress("poses", 0, total)),
+            )
+            if other is not None and (model is None or other.num_reg_images() > model.num_reg_images()):
+                model = other
+        if model is not None:
             if kept:
                 align(model, {name: poses[name] for name in kept})
             (self._folder / MODEL).mkdir()
             model.write_binary(self._folder / MODEL)
         on_progress("poses", total, total)
+
+    def _mapping_options(self, total: int) -> pycolmap.IncrementalPipelineOptions:
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = self._settings.threads
+        options.random_seed = 0
+        # COLMAP's default would drop the complete model of a capture of few photos.
+        options.min_model_size = min(10, max(3, total // 2))
+        # What is known stays as it is.
+        options.constant_cameras = {number for number, each in enumerate(self._passes, 1) if each.mount is not None}
+        options.ba_refine_sensor_from_rig = False
+        return options
+
+    def _is_lens_known(self, number: int) -> bool:
+        """Whether the photos or the caller say where a camera's lens starts."""
+        with pycolmap.Database.open(self._database) as database:
+            return database.read_camera(number).has_prior_focal_length
 
     def _build_rigs(self) -> None:
         """Join cameras whose places on a rig are known."""

@@ -1,0 +1,46 @@
+"""The lens is found from all photos where the first two would not tell it."""
+
+from __future__ import annotations
+
+import numpy as np
+from small_captures import HEIGHT, WIDTH, poses, write
+
+from benchmarks.sfm_accuracy import center_errors
+
+VIEWS = 8
+
+
+def test_the_lens_and_all_poses_are_found_from_guesses(tmp_path, photos):
+    import PIL.Image  # noqa: F401 - before pycolmap
+    import pycolmap
+
+    from ssa_nerfstudio.sfm.colmap import StructureFromMotion
+    from ssa_nerfstudio.sfm.held_lens import map_with_held_lens
+    from ssa_nerfstudio.sfm.reconstruction import Pass, SfmSettings
+
+    images = write(tmp_path / "images", photos(VIEWS))
+    passes = [Pass(sorted(path.name for path in images.iterdir()), str(images))]
+    structure = StructureFromMotion(images, passes, tmp_path, SfmSettings(threads=1))
+    structure.extract(lambda *_: None)
+    structure.match(lambda *_: None)
+    before = (tmp_path / "database.db").read_bytes()
+
+    def options() -> pycolmap.IncrementalPipelineOptions:
+        made = pycolmap.IncrementalPipelineOptions()
+        made.num_threads, made.random_seed = 1, 0
+        return made
+
+    found = map_with_held_lens(tmp_path / "database.db", images, tmp_path / "held", options, [1], None, lambda: None)
+    assert found is not None
+    views = [image for image in found.images.values() if image.has_pose]
+    assert len(views) == VIEWS
+    focal = WIDTH / 2 / np.tan(np.radians(65 / 2))
+    np.testing.assert_allclose(found.cameras[1].params[:2], focal, rtol=0.05)
+    true = poses(VIEWS)[:, :3, 3]
+    centers = np.array([image.projection_center() for image in views])
+    numbers = [int(image.name.removeprefix("photo_").removesuffix(".png")) for image in views]
+    extent = np.linalg.norm(true - true.mean(axis=0), axis=1).mean()
+    assert center_errors(centers, true[numbers]).max() < 0.03 * extent
+    assert (found.cameras[1].width, found.cameras[1].height) == (WIDTH, HEIGHT)
+    assert not (tmp_path / "held").exists()
+    assert (tmp_path / "database.db").read_bytes() == before
