@@ -16,7 +16,9 @@ from ssa_nerfstudio.evidence.statistics import ImageStatistics
 _STRENGTH = ("none", "faint", "opaque")
 
 
-def detect_in_intervals(photos: Callable[[], Iterable[Tensor]], draws: int = DRAWS) -> Detection:
+def detect_in_intervals(
+    photos: Callable[[], Iterable[Tensor]], draws: int = DRAWS, whole: ImageStatistics | None = None
+) -> Detection:
     """Test whether the photos of a camera have an artifact, static at least for a while.
 
     The photos are read once; where the artifact changes, a second time.
@@ -24,12 +26,14 @@ def detect_in_intervals(photos: Callable[[], Iterable[Tensor]], draws: int = DRA
     Args:
         photos: yields all photos of the camera, in the order of the capture, each [H, W, 3].
         draws: shifted captures in the null distributions.
+        whole: statistics of all photos, where they are known: the photos are then read only where the artifact changes.
 
     Returns:
         The detection. Where the artifact changes, `intervals` says when; mask and opaque area are what any of them has,
         and verdict and p-value those of the interval with the strongest evidence.
     """
-    (whole,) = _statistics(photos(), [])
+    if whole is None:
+        (whole,) = _statistics(photos(), [])
     cuts = change_points(whole, draws)
     if not cuts:
         return detect(whole, draws)

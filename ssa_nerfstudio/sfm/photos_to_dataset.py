@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
@@ -19,11 +19,11 @@ from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.panorama import cut
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.sfm.detected_mask import check_mask_polarity, detected_mask, has_artifact
+from ssa_nerfstudio.sfm.detected_mask import CameraEvidence
 from ssa_nerfstudio.sfm.existing_model import ExistingModel
 from ssa_nerfstudio.sfm.feature_mask import widened
 from ssa_nerfstudio.sfm.fisheye_guess import fisheye_guess
-from ssa_nerfstudio.sfm.flat_field import MIN_PHOTOS, static_factor, write_flattened
+from ssa_nerfstudio.sfm.flat_field import MIN_PHOTOS, write_flattened
 from ssa_nerfstudio.sfm.ingest import Photo, expected_count, ingest
 from ssa_nerfstudio.sfm.model_repair import Repair
 from ssa_nerfstudio.sfm.nerfstudio_dataset import MASK, write_dataset
@@ -100,17 +100,18 @@ def process(
         inputs = [(*(camera.name for camera in source.cameras), source.fingerprint(), frames) for source in sources]
         dataset = work.subfolder("dataset", inputs)
         photos = _ingest_all(sources, dataset, frames, on_progress)
+        evidence = [_evidence(dataset, each, on_progress) for each in photos[:train]]
         if mask is not None:
-            for used, each in zip(masks, photos, strict=False):
+            for used, each in zip(masks, evidence, strict=True):
                 assert used is not None
-                check_mask_polarity(used, *_detection(dataset, each, on_progress))
+                each.check_mask_polarity(used)
         elif detect:
-            masks = [_detected(dataset, photos[number], on_progress) for number in range(train)]
+            masks = [None if (found := each.opaque_mask()) is None else widened(found) for each in evidence]
         poses = {} if known is None else _poses(known, photos)
         start = [known and known.lenses, *((name, pose.tolist()) for name, pose in poses.items())]
         asked = [inputs, [*map(_digest, masks)], asdict(settings) | {"threads": None}, start]
         motion = work.subfolder("motion", asked)
-        passes = _passes(sources, photos, dataset / "images", motion, masks, settings, on_progress)
+        passes = _passes(sources, photos, dataset / "images", motion, masks, evidence, settings, on_progress)
         if known is not None:
             passes[:train] = [replace(each, lens=lens) for each, lens in zip(passes, known.lenses, strict=False)]
         found = reconstruct(dataset / "images", passes, motion, settings, on_progress, poses)
@@ -179,17 +180,9 @@ def _ingest_all(
     return photos
 
 
-def _detected(dataset: Path, photos: Sequence[Photo], on_progress: ProgressCallback) -> np.ndarray | None:
-    mask = detected_mask(*_detection(dataset, photos, on_progress))
-    return None if mask is None else widened(mask)
-
-
-def _detection(
-    dataset: Path, photos: Sequence[Photo], on_progress: ProgressCallback
-) -> tuple[list[Path], Callable[[int], None]]:
-    """What detection reads, and where it says how far it is."""
+def _evidence(dataset: Path, photos: Sequence[Photo], on_progress: ProgressCallback) -> CameraEvidence:
     files = [dataset / "images" / photo.name for photo in photos]
-    return files, lambda done: on_progress("detection", done, len(files))
+    return CameraEvidence(files, lambda done: on_progress("detection", done, len(files)))
 
 
 def _passes(
@@ -198,6 +191,7 @@ def _passes(
     images: Path,
     folder: Path,
     masks: Sequence[np.ndarray | None],
+    evidence: Sequence[CameraEvidence],
     settings: SfmSettings,
     on_progress: ProgressCallback,
 ) -> list[Pass]:
@@ -215,7 +209,7 @@ def _passes(
         if number >= len(masks):
             passes.append(Pass(names, str(images), None, lens, mount))
             continue
-        copies = _flatten(names, images, folder / "flat", settings, on_progress)
+        copies = _flatten(names, images, folder / "flat", evidence[number], settings, on_progress)
         file = None
         if (mask := masks[number]) is not None:
             file = str(folder / (MASK if len(masks) == 1 else f"{Path(MASK).stem}_{camera.name}.png"))
@@ -225,24 +219,25 @@ def _passes(
 
 
 def _flatten(
-    names: list[str], images: Path, folder: Path, settings: SfmSettings, on_progress: ProgressCallback
+    names: list[str],
+    images: Path,
+    folder: Path,
+    evidence: CameraEvidence,
+    settings: SfmSettings,
+    on_progress: ProgressCallback,
 ) -> Path:
     """Folder of the photos without their static factor; `images` where they have none or settings disable it."""
     if not settings.flatten or len(names) < MIN_PHOTOS:
         return images
-    done = sum((folder / name).is_file() for name in names) if folder.is_dir() else 0
-    if done < len(names):
+    if not (folder.is_dir() and all((folder / name).is_file() for name in names)):
         on_progress("artifact", 0, len(names))
         files = [images / name for name in names]
         # A walk straight ahead has static edges of its own, which belong to the scene.
-        factor = static_factor(files, settings.max_image_size) if has_artifact(files) else None
-        if factor is None:
+        stretches = evidence.unchanged_stretches()
+        size = settings.max_image_size
+        if not write_flattened(files, stretches, folder, size, lambda done: on_progress("artifact", done, len(names))):
             on_progress("artifact", len(names), len(names))
             return images
-        folder.mkdir(exist_ok=True)
-        for number, name in enumerate(names, 1):
-            write_flattened(images / name, folder / name, factor)
-            on_progress("artifact", number, len(names))
     return folder
 
 
