@@ -1,10 +1,12 @@
-"""Hysteresis of static edges. Evidence itself is tested with detection."""
+"""Evidence of static edges at a pixel, and their hysteresis. What follows from it is tested with detection."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
+import torch
 
-from ssa_nerfstudio.evidence.edge_evidence import _mostly_still
+from ssa_nerfstudio.evidence.edge_evidence import _mostly_still, evidence_field
 
 
 def test_connected_edges_are_kept_if_a_tenth_of_them_is_still():
@@ -15,3 +17,11 @@ def test_connected_edges_are_kept_if_a_tenth_of_them_is_still():
     kept = _mostly_still(edges, still)
     assert (kept[2] == edges[2]).all()
     assert not kept[6].any()
+
+
+def test_evidence_is_the_mean_gradient_over_its_standard_error():
+    """Three blocks whose gradients are 3, 4 and 5 tenths along x and 0, 1 and 2 tenths along y."""
+    x, y = torch.tensor([0.3, 0.4, 0.5]), torch.tensor([0.0, 0.1, 0.2])
+    sums = torch.stack([x.sum(), y.sum(), (x**2 + y**2).sum()]).reshape(3, 1, 1)
+    error = float(x.var(correction=0) + y.var(correction=0)) / 2 + (1 / 255 / 6) ** 2
+    assert evidence_field(sums, 3).item() == pytest.approx((0.4**2 + 0.1**2) ** 0.5 / error**0.5, rel=1e-4)
