@@ -105,6 +105,8 @@ def _run(name: str, options: list[str]) -> None:
             command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
             read = getattr(command, "read", partial(arguments.read, command))
             requested = read(options, f"ssa {name}", COMMANDS[name])
+            # Its C code prints a traceback of its own where ctrl+c interrupts it, and every command needs it.
+            importlib.import_module("cv2")
         requested.run()
     except ImportError as error:  # also of a library that misses an optional package of its own
         if name not in EXPERIMENTS or (error.name or "").startswith("ssa_nerfstudio"):

@@ -67,7 +67,7 @@ def said(words: list[str], capsys) -> str:
 def test_an_unknown_option(name, capsys):
     line = said([name, *required(name), "--nonsense", "1"], capsys)
     assert "error: Unrecognized options: --nonsense, 1" in line
-    assert line.endswith(f"(ssa {name} --help)\n")
+    assert f"(ssa {name} --help)" in line
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS))
