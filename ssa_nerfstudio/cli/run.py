@@ -51,6 +51,11 @@ class Command:
             InputError: as `arguments.read`.
         """
         own, forwarded = arguments.split_forwarded(options, STAGES)
+        files = [word for word in own if not word.startswith("-") and Path(word).is_file()]
+        if len(files) > 1:
+            raise InputError(f"PHOTOS is one folder or video, not {len(files)} files", f"give {Path(files[0]).parent}")
+        if "--photos" in own:
+            raise InputError("PHOTOS has no option's name", "ssa run PHOTOS --output OUT")
         _, _, forwarding = (inspect.getdoc(cls) or "").partition("\n\n")
         try:
             command = arguments.read(cls, own, program, f"{description}\n\n{forwarding}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,6 +21,8 @@ PHOTO_SUFFIXES = {".jpg", ".jpeg", ".png", ".heic", ".heif", ".webp", ".tif", ".
 """Suffixes of photos, in lower case."""
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts"}
 """Suffixes of videos, in lower case."""
+_LOOKED_AT = 1000
+"""Files and folders below a folder without photos, among which to look for some."""
 _ON_THE_SIDE = {5, 6, 7, 8}
 
 
@@ -139,7 +142,10 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
     photos, videos = _media(path)
     if not photos and not videos:
         known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
-        raise InputError(f"{path} holds no photo and no video ({known})", "put them there or name another folder")
+        below = (file for file in islice(path.rglob("[!.]*"), _LOOKED_AT) if file.suffix.lower() in PHOTO_SUFFIXES)
+        first = next(below, None)
+        remedy = "put them there or name another folder" if first is None else f"give {first.parent}, which does"
+        raise InputError(f"{path} holds no photo and no video ({known})", remedy)
     if not photos:
         return _videos(path, name, videos)
     if len(photos) < min_photos:

@@ -107,3 +107,10 @@ def test_the_photos_of_one_camera_are_one_source(tmp_path):
     (tmp_path / "thumbnails").mkdir()
     touch_photos(tmp_path / "thumbnails", "0.png")
     assert read_sources(tmp_path, "frame", 3) == [read_source(tmp_path, "frame", 3)]
+
+
+def test_photos_further_down_are_pointed_at(tmp_path):
+    (tmp_path / "card/DCIM/100MEDIA").mkdir(parents=True)
+    touch_photos(tmp_path / "card/DCIM/100MEDIA", "0.png", "1.png", "2.png")
+    with pytest.raises(InputError, match=r"holds no photo and no video .* give .*100MEDIA, which does"):
+        read_sources(tmp_path / "card", "frame", 3)

@@ -181,6 +181,7 @@ def test_the_page_fits_a_narrow_window_and_its_line_can_be_moved(finished):
             ["--pipeline.model.overlay", "on"],
             "given as --detect.NAME, --process.NAME, --train.NAME",
         ),
+        (["--photos", "there"], "ssa run PHOTOS --output OUT"),
         (["--process.matching", "sequential"], "--process.matching: "),
     ],
 )
@@ -190,6 +191,12 @@ def test_wrong_options_end_before_any_work(tiny_scene, tmp_path, capsys, options
     assert caught.value.code == 2
     assert expected in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_list_of_photos_is_answered_with_their_folder(tiny_scene, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        run(*sorted((tiny_scene / "images").iterdir()), "--output", tmp_path / "out")
+    assert f"give {tiny_scene / 'images'}" in capsys.readouterr().err
 
 
 def test_its_help_says_that_options_of_the_stages_are_passed_on(capsys):
