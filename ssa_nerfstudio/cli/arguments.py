@@ -14,6 +14,9 @@ from ssa_nerfstudio.errors import InputError
 
 T = TypeVar("T")
 
+_NO_HELP = ("For full helptext", "Argument helptext", "Available subcommands")
+"""Beginnings of what tyro says beside the error: nerfstudio's subcommands are readers of fifteen dataset formats."""
+
 
 def read(command: type[T], arguments: list[str], program: str, description: str, **defaults: Any) -> T:
     """Build a command from its options.
@@ -64,6 +67,4 @@ def _one_line(report: str) -> str:
     for section in sections or [title]:
         lines = [re.sub(r"^│ ?|│$|\[/?bold\]", "", line.rstrip()) for line in section.splitlines()]
         messages.append(" ".join(" ".join(line for line in lines if not line.startswith(" " * 8)).split()))
-    return "; ".join(
-        text for text in messages if text and not text.startswith(("For full helptext", "Argument helptext"))
-    )
+    return "; ".join(text for text in messages if text and not text.startswith(_NO_HELP))

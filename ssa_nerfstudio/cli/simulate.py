@@ -74,4 +74,5 @@ class Command:
         train, _, test = dataset.split
         console = plain_console()
         console.print(f"{self.output}: {len(train)} training photos, {len(test)} clean test photos")
-        console.print(f"Train on it: ns-train ssa-splatfacto --data {shlex.quote(str(self.output))}")
+        data, out = (shlex.quote(str(path)) for path in (self.output, self.output.with_name(f"{self.output.name}-run")))
+        console.print(f"Make splats of it: ssa run {data} --output {out}")

@@ -58,7 +58,7 @@ def with_faces(
             if projection == "auto" and twice:
                 _LOG.warning(
                     f"the 2:1 photos of {source.path} are taken for perspective ones: their edges do not continue each "
-                    "other, or the poles are no single color (--projection equirectangular cuts them into faces)"
+                    "other, or neither pole is a single color (--projection equirectangular cuts them into faces)"
                 )
             faces.append(())
     if left_out and not any(faces):
@@ -79,7 +79,9 @@ def cut_into_faces(source: Source) -> str:
 
 
 def wraps_around(source: Source) -> bool:
-    """Whether 2:1 photos are equirectangular: the left edge continues the right one, and each pole is one color.
+    """Whether 2:1 photos are equirectangular: the left edge continues the right one, and a pole is one color.
+
+    One pole: over the other an editor may have written something, or laid a logo.
 
     Decided by the median of five photos, evenly spaced.
 
@@ -104,4 +106,4 @@ def _wraps_around(picture: np.ndarray) -> bool:
 
     rows = small.std(axis=1).mean(axis=-1)
     joined = step(0, -1) <= _MAX_STEP * (step(0, 1) + step(-1, -2)) / 2 + _LEVELS
-    return joined and max(rows[0], rows[-1]) <= _MAX_POLE * np.median(rows) + _LEVELS
+    return joined and min(rows[0], rows[-1]) <= _MAX_POLE * np.median(rows) + _LEVELS

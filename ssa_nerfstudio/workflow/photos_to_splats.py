@@ -128,7 +128,8 @@ def _process(plan: Plan, process: Callable[[ProgressCallback], Summary], on_prog
         return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
     summary = process(on_progress)
     registered, photos = sum(each.count for each in summary.passes), sum(each.photos for each in summary.passes)
-    missing = [name for each in summary.passes for name in each.missing]
+    several = len(summary.passes) > 1
+    missing = [f"{each.name}: {name}" if several else name for each in summary.passes for name in each.missing]
     warning = f"no pose was found for {name_list(missing)}; where parts of the "
     warning += "scene are missing, add photos between them and their neighbors"
     repaired = "" if summary.repair is None else f"; of the model, {summary.repair.in_words()}"
@@ -147,7 +148,7 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     overlays, kind = len(layers), "intervals" if any(layer.start != BEGINNING for layer in layers) else "cameras"
     decided = {0: "the scene alone was learned", 1: "the artifact was learned with the scene"}
     text = decided.get(overlays, f"the artifacts of {overlays} {kind} were learned with the scene")
-    resumed = f" (continued at step {began:,})" if began else ""
+    resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
     return Result(
         f"{text}, in {checkpoint.step + 1:,} steps{resumed}", (*plan.training_warnings, *missed_artifacts(plan, layers))
     )

@@ -111,7 +111,8 @@ class RunRecord:
             for name, choice in stage.choices.items():
                 if former.get(name) != choice:
                     raise InputError(
-                        f"{self._path.parent} was begun with {name} {_words(former.get(name))}, not {_words(choice)}",
+                        f"{self._path.parent} was begun with {_words(name, former.get(name))}, not "
+                        f"{_words(name, choice)}",
                         "repeat what it was begun with to continue, or choose another --output",
                     )
 
@@ -219,5 +220,9 @@ def _collected_warnings(on_decision: Callable[[str], None]) -> Iterator[list[log
         logger.setLevel(level)
 
 
-def _words(choice: object) -> str:
-    return " ".join(map(str, choice)) if isinstance(choice, list) and choice else f"{choice or 'nothing'}"
+def _words(name: str, choice: object) -> str:
+    """A choice as it is typed: options of other commands, a list, carry the prefix that their name is."""
+    if isinstance(choice, list):
+        words = [f"{name}{word.removeprefix('--')}" if word.startswith("--") else word for word in choice]
+        return " ".join(words) or f"no {name} options"
+    return f"{name} {choice or 'nothing'}"

@@ -36,6 +36,13 @@ def test_360_photos_are_recognized_with_an_operator_and_without(round_photos, tm
     assert wraps_around(source(tmp_path / "operator", [with_operator(photo) for photo in round_photos], ".jpg"))
 
 
+def test_writing_over_one_pole_leaves_360_photos_recognized(round_photos, tmp_path):
+    written = [photo.copy() for photo in round_photos]
+    for photo in written:
+        photo[-10:, 30:130:3] = 255 - photo[-10:, 30:130:3]
+    assert wraps_around(source(tmp_path / "written", written))
+
+
 def test_a_360_video_is_recognized(round_photos, tmp_path):
     clip = write_clip(tmp_path / "clip.mp4", round_photos)
     assert with_faces(read_sources(clip, "frame", min_photos=3))[0].faces

@@ -82,12 +82,15 @@ def asked(folder: Path, fails: bool = False, bound: bool = False, **choices) -> 
 
 
 def test_a_finished_stage_is_not_continued_with_other_choices(tmp_path):
-    asked(tmp_path / "run", steps=3, train=[])
-    with pytest.raises(InputError, match=r"begun with steps 3, not 4; repeat"):
-        asked(tmp_path / "run", steps=4, train=[])
-    with pytest.raises(InputError, match=r"begun with train nothing, not --vis viewer"):
-        asked(tmp_path / "run", steps=3, train=["--vis", "viewer"])
-    asked(tmp_path / "run", steps=3, train=[])
+    def begun(steps: int = 3, train: tuple[str, ...] = ()) -> None:
+        asked(tmp_path / "run", **{"--steps": steps, "--train.": [*train]})
+
+    begun()
+    with pytest.raises(InputError, match=r"begun with --steps 3, not --steps 4; repeat"):
+        begun(4)
+    with pytest.raises(InputError, match=r"begun with no --train\. options, not --train\.vis viewer; repeat"):
+        begun(train=("--vis", "viewer"))
+    begun()
 
 
 @pytest.mark.parametrize("bound", [False, True])
@@ -95,11 +98,11 @@ def test_a_stage_that_failed_takes_other_choices_unless_it_is_bound(tmp_path, bo
     with pytest.raises(InputError, match="broken"):
         asked(tmp_path / "run", fails=True, bound=bound, share=0.5)
     if bound:
-        with pytest.raises(InputError, match=r"begun with share 0.5, not 0.4"):
+        with pytest.raises(InputError, match=r"begun with share 0.5, not share 0.4"):
             asked(tmp_path / "run", bound=True, share=0.4)
         return
     asked(tmp_path / "run", share=0.4)
-    with pytest.raises(InputError, match=r"begun with share 0.4, not 0.5"):
+    with pytest.raises(InputError, match=r"begun with share 0.4, not share 0.5"):
         asked(tmp_path / "run", share=0.5)
 
 
