@@ -201,6 +201,22 @@ def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tm
 
 
 @pytest.mark.slow
+def test_runs_begin_in_the_order_of_their_importance(tmp_path):
+    """They fail at once, for there is no dataset."""
+    begun: list[str] = []
+
+    def watch(requests, waiting):
+        begun.extend(request.run.id for request in requests if request.run.id not in begun)
+
+    runs = plan(benchmark())[:6]
+    runner = DaskRunner(ResultsFolder(tmp_path), [], 2, lambda run: "the command")
+    assert runner.work(runs, lambda run: None, None, watch, lambda *_: None) == []
+    places = [runs.index(next(run for run in runs if run.id == id)) for id in begun]
+    assert len(places) == 6
+    assert all(abs(place - at) <= 1 for at, place in enumerate(places))
+
+
+@pytest.mark.slow
 def test_a_process_that_was_killed_while_it_waited_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
     runs = plan(benchmark())[:2]

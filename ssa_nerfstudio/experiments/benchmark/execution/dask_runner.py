@@ -75,24 +75,23 @@ class DaskRunner:
         if not todo:
             return left
         with self._client() as client:
-            futures = {}
-            begun: set[str] = set()
+            futures: dict[Any, Run] = {}
             try:
-                for number, run in enumerate(todo):
-                    task = self._request(run), self._prepares() and number < len(todo) - 1
-                    futures[client.submit(perform, *task, key=run.id, priority=-number, pure=False, retries=0)] = run
-                while futures and remaining() > 0:
+                while (todo or futures) and remaining() > 0:
                     for future in [f for f in futures if f.status in ("finished", "error", "cancelled", "lost")]:
                         ended(futures.pop(future), future.result() if future.status == "finished" else None)
+                    # No more than the workers take at once: what a scheduler holds it hands out in an order of its own.
+                    while todo and len(futures) < sum(client.nthreads().values()):
+                        run = todo.pop(0)
+                        if (estimate(run) or 0.0) > remaining():
+                            left.append(run)
+                            continue
+                        task = self._request(run), self._prepares() and bool(todo)
+                        futures[client.submit(perform, *task, key=run.id, pure=False, retries=0)] = run
                     requests = [request for run in futures.values() if (request := self._at_work(run)) is not None]
-                    begun |= {request.run.id for request in requests}
-                    for future, run in list(futures.items()):
-                        if run.id not in begun and (estimate(run) or 0.0) > remaining():
-                            future.cancel()
-                            left.append(futures.pop(future))
-                    watch(requests, len(futures) - len(requests))
+                    watch(requests, len(todo) + len(futures) - len(requests))
                     time.sleep(POLL)
-                return sorted([*left, *futures.values()], key=runs.index)
+                return sorted([*left, *futures.values(), *todo], key=runs.index)
             finally:
                 self._stop(client, futures)
 
