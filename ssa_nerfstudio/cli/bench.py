@@ -102,7 +102,12 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
             console.print(f"{len({run.dataset for run in runs})} datasets are ready in {place.scenes}")
             return [], []
         options = bench.Options(
-            command.threads, command.runs_per_device, command.time_limit, command.scheduler, command.keep_models
+            command.threads,
+            command.runs_per_device,
+            command.time_limit,
+            command.scheduler,
+            command.keep_models,
+            compile_first=name == "tradeoff",
         )
         left = bench.bench(runs, place, f"ssa {name} {command.benchmark}", options, console)
     if left:

@@ -11,6 +11,8 @@ from made_results import benchmark, folder_of, result
 from PIL import Image
 
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.execution import warm_up
+from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.report.tradeoff_report import analyze
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Tradeoff
@@ -131,3 +133,32 @@ def test_missing_runs_are_named(tmp_path):
     assert f"1 of 4 planned ones are missing: `{made[0].run.id}`." in text
     analyze([folder_of(tmp_path, made)], tmp_path / "out", IDS)
     assert "0 of 4 planned ones are missing." in (tmp_path / "out" / "tradeoff.md").read_text()
+
+
+def test_kernels_are_compiled_by_short_runs_that_leave_nothing(tmp_path, monkeypatch):
+    """One for each size of photos and densification, on the datasets that are there."""
+    trained = []
+
+    class Runner:
+        def __init__(self, place, devices, *_):
+            self.place, self.devices = place, devices
+
+        def work(self, runs, *_):
+            for run in runs:
+                assert (self.place.scenes / run.dataset / "photo").exists()
+                trained.append((run.steps, run.marks, run.image_scale, run.densification, self.devices))
+            (self.place.folder / "results").mkdir()
+
+    monkeypatch.setattr(warm_up, "DaskRunner", Runner)
+    tradeoff = Tradeoff(("barn",), knobs={"steps": [1000], "image_scale": [0.5], "densification": ["mcmc"]})
+    runs = plan_tradeoff(benchmark(tradeoff=tradeoff))
+    (tmp_path / "scenes" / runs[0].dataset).mkdir(parents=True)
+    (tmp_path / "scenes" / runs[0].dataset / "photo").touch()
+    before = sorted(tmp_path.rglob("*"))
+    assert warm_up.warm_up(runs, ResultsFolder(tmp_path), "3", None) == 3
+    assert sorted(trained) == [
+        (60, (), 0.5, "adc", ["3"]),
+        (60, (), 1.0, "adc", ["3"]),
+        (60, (), 1.0, "mcmc", ["3"]),
+    ]
+    assert sorted(tmp_path.rglob("*")) == before

@@ -17,6 +17,7 @@ from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
 from ssa_nerfstudio.experiments.benchmark.execution.progress_table import ProgressTable
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.execution.run_process import configuration
+from ssa_nerfstudio.experiments.benchmark.execution.warm_up import warm_up
 from ssa_nerfstudio.experiments.benchmark.results import Result, adopt, read_all
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.experiments.runs.machine import devices
@@ -34,6 +35,8 @@ class Options:
     scheduler: str | None = None
     """Address of a dask.distributed scheduler."""
     keep_models: bool = False
+    compile_first: bool = False
+    """Compile kernels before the first run's clock; not on a cluster, nor where runs share a device."""
 
 
 def select(runs: list[Run], scenes: tuple[str, ...], only: tuple[str, ...]) -> list[Run]:
@@ -93,6 +96,9 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
         return f"{invocation} --output {shlex.quote(str(place.folder))} --only {shlex.quote(run.id)}"
 
     found = devices()
+    if todo and options.compile_first and options.scheduler is None and options.runs_per_device == 1:
+        with console.status("Compiling kernels, in short trainings that are not timed ..."):
+            warm_up(todo, place, found[0] if found else None, deadline)
     at_once = max(1, len(found)) * options.runs_per_device
     with ProgressTable(console, len(runs), len(runs) - len(missing), at_once) as table:
         estimate = RuntimeEstimate(results)
