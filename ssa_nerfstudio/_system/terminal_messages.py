@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from ssa_nerfstudio.errors import InputError, SSAError, TrainingError, TrainingStopped
@@ -28,15 +29,28 @@ def plain_console() -> Console:
     """A console for text that holds paths: `[x]` is no markup and `:x:` no emoji, and lines are not wrapped."""
     from rich.console import Console  # not before ctrl+c is handled
 
-    return Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
+    class PlainConsole(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # and not rich's exit with code 1
+
+    return PlainConsole(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
-def refusal(error: OSError) -> InputError | None:
+def refusal(error: BaseException) -> InputError | None:
     """What an error of the operating system says to a user: which file, and why. None where it does not say why."""
-    if not error.strerror:
+    if _of_memory(error):
+        about = f" ({text})" if (text := " ".join(str(error).split(". ")[0].split())) else ""
+        return InputError(f"memory ran out{about:.200}", "close other programs, or use smaller photos")
+    if not isinstance(error, OSError) or not error.strerror:
         return None
     name = os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes)) else "the system refused a file"
     return InputError(f"{name}: {error.strerror}", "check the path, its permissions and the room on its disk")
+
+
+def _of_memory(error: BaseException) -> bool:
+    """Whether this is Python's, torch's or OpenCV's way to say that there is no more memory."""
+    named = isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    return named or any(text in str(error) for text in ("DefaultCPUAllocator: can't allocate", "Insufficient memory"))
 
 
 def print_error(error: SSAError) -> int:
@@ -62,4 +76,6 @@ class _OneLineHandler(logging.Handler):
 
 def _print_line(kind: str, message: str) -> None:
     line = f"ssa-nerfstudio: {kind}: {' '.join(message.split())}"
-    print(line.encode("utf-8", "backslashreplace").decode(), file=sys.stderr, flush=True)
+    if sys.stderr is not None:
+        with suppress(OSError):  # full or closed: the exit code still says it
+            print(line.encode("utf-8", "backslashreplace").decode(), file=sys.stderr, flush=True)

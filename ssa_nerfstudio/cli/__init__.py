@@ -85,7 +85,7 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
     except BrokenPipeError:  # as of `| head`: who read the output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         raise SystemExit(terminal_messages.BROKEN_PIPE_EXIT_CODE) from None
-    except OSError as error:
+    except Exception as error:
         refused = terminal_messages.refusal(error)
         if refused is None:
             raise
@@ -96,6 +96,10 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
 
 
 def _run(name: str, options: list[str]) -> None:
+    try:
+        os.getcwd()
+    except OSError as error:  # as where it was deleted; libraries end the process without a reason there
+        raise InputError(f"the working directory cannot be used ({error.strerror})", "change to another") from error
     if name not in COMMANDS:
         raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")
     try:
@@ -109,8 +113,13 @@ def _run(name: str, options: list[str]) -> None:
             importlib.import_module("cv2")
         requested.run()
     except ImportError as error:  # also of a library that misses an optional package of its own
-        if name not in EXPERIMENTS or (error.name or "").startswith("ssa_nerfstudio"):
+        if (error.name or "").startswith("ssa_nerfstudio"):
             raise
+        if name not in EXPERIMENTS:
+            raise InputError(
+                f"a library that ssa {name} needs cannot be loaded ({error})",
+                "pip install --force-reinstall ssa-nerfstudio, or free memory",
+            ) from error
         raise InputError(
             f"ssa {name} needs a package that is not installed ({error})", "pip install 'ssa-nerfstudio[experiments]'"
         ) from error

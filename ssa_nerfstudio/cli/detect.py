@@ -19,7 +19,7 @@ class Command:
     """A nerfstudio dataset (its training photos), a folder of photos or videos, or one video."""
     output: Path | None = None
     """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Default:
-    outputs/detection/NAME, which is replaced."""
+    outputs/detection/NAME, where an earlier detection is replaced."""
     json: Path | None = None
     """File to write verdict, coverage, p_value, views and more of each camera to; must not exist."""
     draws: int = 200
@@ -45,6 +45,25 @@ class Command:
         if self.output is not None and self.output.exists():
             raise InputError(f"{self.output} exists already", "remove it or choose another --output")
 
+    def place(self) -> Path:
+        """The folder to write to.
+
+        Raises:
+            InputError: it is not given, and that of the data's name holds what no detection wrote.
+        """
+        if self.output is not None:
+            return self.output
+        from ssa_nerfstudio.evidence.capture_detection import FILES
+
+        data = self.data.resolve()
+        place = Path("outputs/detection") / ((data.name if data.is_dir() else data.stem) or "root")
+        other = [path.name for path in place.rglob("*") if not path.is_dir() and path.name not in FILES]
+        if other or place.is_symlink():
+            raise InputError(
+                f"{place} {f'holds {other[0]}' if other else 'is a link'} and is not replaced", "choose an --output"
+            )
+        return place
+
     def run(self) -> None:
         """Detect, print the verdict, and write evidence, masks and JSON.
 
@@ -63,7 +82,7 @@ class Command:
         from ssa_nerfstudio.evidence.verdict_in_words import verdict_in_words
 
         self.check()
-        output = self.output or Path("outputs/detection") / self.data.resolve().stem
+        output = self.place()
         console = plain_console()
         cameras = read_cameras(self.data, self.frames)
         found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}

@@ -71,12 +71,16 @@ class Command:
         if self.apply is not None:
             photos = find_photos(self.apply)
             frames = [*raw, *undistorted]
-            if len(raw) > 1:
-                if self.camera is None or not 0 <= self.camera < len(raw):
+            if self.camera is None and len(raw) > 1:
+                raise InputError(
+                    f"the run has {len(raw)} overlays: {', '.join(layers.name for layers in raw)}",
+                    f"choose that of these photos: --camera 0 to {len(raw) - 1}; where the artifact changes, "
+                    "ssa export-dataset --photos cleaned chooses each photo's own",
+                )
+            if self.camera is not None:
+                if not 0 <= self.camera < len(raw):
                     raise InputError(
-                        f"the run has {len(raw)} overlays: {', '.join(layers.name for layers in raw)}",
-                        f"choose that of these photos: --camera 0 to {len(raw) - 1}; where the artifact changes, "
-                        "ssa export-dataset --photos cleaned chooses each photo's own",
+                        f"the run has no overlay {self.camera}", f"there are {len(raw)}, counted from --camera 0"
                     )
                 frames = [raw[self.camera], undistorted[self.camera]]
         console = plain_console()

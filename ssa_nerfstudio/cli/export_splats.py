@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
+
+_MAX_FLOAT32 = 3.4e38
 
 
 @dataclass
@@ -45,7 +46,7 @@ class Command:
             raise InputError("a box needs all of --obb-center, --obb-rotation and --obb-scale")
         for name in ("obb_center", "obb_rotation", "obb_scale"):
             values = getattr(self, name) or ()
-            if not all(map(math.isfinite, values)):
+            if not all(abs(value) <= _MAX_FLOAT32 for value in values):
                 raise InputError(f"--{name.replace('_', '-')} must be finite, got {values}")
         if min(self.obb_scale or (1,)) <= 0:
             raise InputError(f"--obb-scale must be positive, got {self.obb_scale}")
@@ -62,6 +63,8 @@ class Command:
         checkpoint = Checkpoint.read(self.load_config, self.step)
         gaussians = checkpoint.gaussians()
         inside = within(gaussians, *box) if all(box) else None  # pyright: ignore[reportArgumentType]
+        if inside is not None and not inside.any():
+            raise InputError(f"no Gaussian of {len(inside)} is in the box", "choose another center, or larger sizes")
         selection = select(gaussians, inside)
         path = self.output_dir / self.output_filename
         console = plain_console()

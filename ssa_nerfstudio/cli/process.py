@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -77,6 +78,7 @@ class Command:
             InputError: an option or a file cannot be used.
         """
         from ssa_nerfstudio.data.equirectangular import with_faces
+        from ssa_nerfstudio.data.photos import MAX_PIXELS
         from ssa_nerfstudio.data.sources import read_source, read_sources
         from ssa_nerfstudio.sfm.existing_model import read_existing_model
         from ssa_nerfstudio.sfm.feature_mask import read_mask
@@ -93,6 +95,10 @@ class Command:
         two = self.clean is not None
         sources = read_sources(self.train, "train" if two else "frame", min_photos=3)
         clean = None if self.clean is None else read_source(self.clean, "clean", min_photos=1)
+        if clean is not None:
+            trained = {os.path.realpath(file) for source in sources for file in source.files}
+            if twice := [file for file in clean.files if os.path.realpath(file) in trained]:
+                raise InputError(f"{twice[0]} is in --train, too", "--clean takes photos without the artifact")
         if clean is not None and clean.name in {source.name for source in sources}:
             raise InputError(f"{self.train} has a camera called {clean.name}, as --clean", "rename its folder")
         known = None
@@ -113,9 +119,9 @@ class Command:
             )
         mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
         model = "OPENCV_FISHEYE" if self.projection == "fisheye" else "OPENCV"
-        settings = SfmSettings(
-            self.matching, self.max_image_size, self.flatten, self.filter_stationary, model, self.threads
-        )
+        # More have no use, and COLMAP fails at numbers beyond what it can start or count.
+        threads, size = min(self.threads, os.cpu_count() or 1), min(self.max_image_size, MAX_PIXELS)
+        settings = SfmSettings(self.matching, size, self.flatten, self.filter_stationary, model, threads)
         detect = self.detect or known is not None
         return sources, partial(
             process, sources, self.output, mask, detect, clean, self.frames, self.min_registered, settings, known

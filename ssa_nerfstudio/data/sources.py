@@ -70,6 +70,11 @@ class Source:
         """Of the dataset's photos, pixels."""
         return self.faces[0].size if self.faces else max(self.width, self.height)
 
+    @property
+    def files(self) -> list[Path]:
+        """The photos, or the videos."""
+        return [*self.photos] or [video.path for video in self.videos]
+
     def video_frames(self, count: int) -> Iterator[tuple[Video, int, np.ndarray]]:
         """Sharp frames of all videos in order, from each as many as its share of all frames.
 
@@ -86,8 +91,7 @@ class Source:
 
     def fingerprint(self) -> list[list[str | int]]:
         """Name, size and modification time of every file, which tell whether the input has changed."""
-        files = self.photos or [video.path for video in self.videos]
-        return [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in files]
+        return [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in self.files]
 
 
 def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
@@ -142,6 +146,8 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
     photos, videos = _media(path)
     if not photos and not videos:
         known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
+        if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file():
+            raise InputError(f"{path} is one photo", f"give the folder of all photos, {path.parent}")
         below = (file for file in islice(path.rglob("[!.]*"), _LOOKED_AT) if file.suffix.lower() in PHOTO_SUFFIXES)
         first = next(below, None)
         remedy = "put them there or name another folder" if first is None else f"give {first.parent}, which does"

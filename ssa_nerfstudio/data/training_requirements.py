@@ -46,6 +46,35 @@ def check_training(
     _check_split(transforms, splits)
 
 
+def check_split_options(transforms: Transforms, mode: str, fraction: float, interval: int) -> None:
+    """Check nerfstudio's options of the split that it makes where the file states none.
+
+    Args:
+        transforms: of the dataset.
+        mode: eval_mode of nerfstudio-data: fraction, filename, interval or all.
+        fraction: train_split_fraction; share of the photos to train on, for that mode.
+        interval: eval_interval; one photo in so many is for evaluation, for that mode.
+
+    Raises:
+        InputError: no split can be made with them.
+    """
+    if any(transforms.stated_split(split) is not None for split in SPLITS):
+        return
+    names = [Path(frame["file_path"]).name for frame in transforms.frames]
+    if mode == "fraction" and not MIN_VIEWS / len(names) <= fraction <= 1:
+        raise InputError(
+            f"--train-split-fraction {fraction:g} leaves no two of {len(names)} photos to train on, or more than all",
+            "give a share of the photos, such as 0.9",
+        )
+    if mode == "interval" and interval < 2:
+        raise InputError(f"--eval-interval must be at least 2, got {interval}")
+    other = [name for name in names if "train" not in name and "eval" not in name]
+    if mode == "filename" and other:
+        raise InputError(
+            f"--eval-mode filename: {other[0]} has neither train nor eval in its name", "choose another --eval-mode"
+        )
+
+
 def _check_split(transforms: Transforms, needed: Iterable[Split]) -> None:
     stated = {split: transforms.stated_split(split) for split in SPLITS}
     if all(names is None for names in stated.values()):

@@ -74,14 +74,16 @@ class Transforms:
             data: the dataset's folder, or its .json file.
 
         Raises:
-            InputError: the file is missing, no JSON, or one of these is missing or wrong.
+            InputError: the file is missing, unreadable, no JSON, or one of these is missing or wrong.
         """
         path = data if data.suffix == ".json" else data / "transforms.json"
         if not path.is_file():
             raise InputError(f"{path} does not exist", "choose a folder that ns-process-data or ssa process made")
         try:
             meta = json.loads(path.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError) as error:
+        except OSError as error:
+            raise InputError(f"{path} cannot be read ({error.strerror})", "check its permissions") from error
+        except (ValueError, RecursionError) as error:
             raise InputError(f"{path} is no valid JSON ({error})", "write it again with ns-process-data") from error
         result = cls(path, meta)
         result._check_frames()
@@ -278,8 +280,14 @@ def _number(key: str, value: Any) -> float:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is such a file; False where no file can have that name."""
+    """Whether there is such a file; False where no file can have that name.
+
+    Raises:
+        PermissionError: a folder on the way to it may not be entered.
+    """
     try:
         return path.is_file()
+    except PermissionError:
+        raise
     except OSError:  # a name that is too long
         return False

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import tempfile
@@ -42,14 +43,23 @@ def staged_folder(output: Path) -> Iterator[Path]:
         InputError: `output` exists or cannot be written.
     """
     if output.exists():
-        raise InputError(f"{output} exists already", "remove it or choose another output folder")
+        raise _exists_already(output)
     with unwritable_as_input_error(output):
         output.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as scratch:
             folder = Path(scratch) / output.name
             folder.mkdir()
             yield folder
-            folder.rename(output)
+            try:
+                folder.rename(output)
+            except OSError as error:
+                if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):  # another process was faster
+                    raise _exists_already(output) from error
+                raise
+
+
+def _exists_already(output: Path) -> InputError:
+    return InputError(f"{output} exists already", "remove it or choose another output folder")
 
 
 @contextmanager

@@ -28,6 +28,9 @@ from ssa_nerfstudio.evidence.detection import DRAWS, Detection
 from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.interval_detection import detect_in_intervals
 
+_MASKS = ("mask_nerfstudio.png", "mask_colmap.png")
+FILES = {"evidence.png", *_MASKS}
+"""What `write_detections` writes of each camera."""
 MIN_PHOTOS = 2
 """With fewer photos of a camera, nothing can be called static."""
 
@@ -116,7 +119,7 @@ def write_detections(folder: Path, detections: dict[str, Detection]) -> None:
         target.mkdir(exist_ok=True)
         Image.fromarray(_evidence_image(detection)).save(target / "evidence.png")
         mask = Image.fromarray((~detection.mask).numpy().astype(np.uint8) * 255)
-        for file in ("mask_nerfstudio.png", "mask_colmap.png"):
+        for file in _MASKS:
             mask.save(target / file)
 
 

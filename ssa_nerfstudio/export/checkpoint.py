@@ -55,7 +55,8 @@ class Checkpoint:
             InputError: the checkpoint does not exist, cannot be read or holds no Gaussian splats.
         """
         if not config.is_file():
-            raise InputError(f"{config} does not exist", "choose the config.yml that ns-train wrote")
+            problem = "is a folder" if config.is_dir() else "does not exist"
+            raise InputError(f"{config} {problem}", "choose the config.yml that ns-train wrote")
         folder = config.parent / _MODELS_FOLDER
         found = newest_first(folder)
         there = ", ".join(str(step_of(path)) for path in found) or "none"

@@ -59,6 +59,8 @@ def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[st
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world_to_camera[:3]))
     count = 0
     if points is not None:
+        if not points.is_file():
+            raise InputError(f"{points}, the sparse points, does not exist", "process the photos again")
         cloud = pycolmap.Reconstruction()
         try:
             cloud.import_PLY(points)

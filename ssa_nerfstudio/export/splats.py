@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -42,7 +43,9 @@ def within(gaussians: dict[str, Tensor], center: Triple, rotation: Triple, scale
     """
     from nerfstudio.data.scene_box import OrientedBox
 
-    return OrientedBox.from_params(center, rotation, scale).within(gaussians["means"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # torch's, about nerfstudio's way to copy
+        return OrientedBox.from_params(center, rotation, scale).within(gaussians["means"])
 
 
 def select(gaussians: dict[str, Tensor], inside: Tensor | None = None) -> Selection:

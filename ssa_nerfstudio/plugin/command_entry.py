@@ -26,7 +26,7 @@ def report_in_one_line() -> None:
     former = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        known = refusal(error) if isinstance(error, OSError) else error
+        known = refusal(error) or error
         if isinstance(error, KeyboardInterrupt):
             known = TrainingStopped(f"{Path(sys.argv[0]).name} was stopped before it began")
         if isinstance(known, SSAError):

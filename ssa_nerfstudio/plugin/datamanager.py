@@ -9,7 +9,7 @@ import os
 from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -99,6 +99,14 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
 
     config: SSADatamanagerConfig
     _train_views: list[Cameras] | None = None
+
+    def __init__(self, config: SSADatamanagerConfig, *args: Any, **kwargs: Any) -> None:
+        try:
+            super().__init__(config, *args, **kwargs)
+        except AssertionError as error:  # how nerfstudio's readers of datasets refuse one
+            data = config.data or config.dataparser.data
+            why = f" ({error})" if str(error) else ""
+            raise InputError(f"nerfstudio cannot read {data}{why}", "look at the options of its reader") from error
 
     def _load_images(self, split: Literal["train", "eval"], cache_images_device: Literal["cpu", "gpu"]):
         if not torch.cuda.is_available():

@@ -15,7 +15,7 @@ from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineC
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
-from ssa_nerfstudio.data.training_requirements import check_seed_points, check_training
+from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.plugin.camera_matching import describe_lenses, fisheye_lenses, group_cameras
@@ -27,7 +27,7 @@ from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelCo
 from ssa_nerfstudio.plugin.overlay_setup import given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
-from ssa_nerfstudio.plugin.validation import check_device, check_settings, check_views
+from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
 _LOG = logging.getLogger(__name__)
@@ -68,6 +68,7 @@ class SSAPipeline(VanillaPipeline):
         if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
             transforms, parser = Transforms.read(source), config.datamanager.dataparser
             check_training(transforms, parser.downscale_factor, ("train", "val" if test_mode == "val" else "test"))
+            check_split_options(transforms, parser.eval_mode, parser.train_split_fraction, parser.eval_interval)
             if test_mode == "val" and parser.load_3D_points:
                 check_seed_points(transforms)
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
@@ -75,6 +76,7 @@ class SSAPipeline(VanillaPipeline):
         self.first_view = FirstView(lambda: self.datamanager.train_dataset.cameras)
         if test_mode == "val":
             cameras = self.datamanager.train_dataset.cameras
+            check_first_resolution(cameras, config.model.num_downscales)
             positions = cameras.camera_to_worlds[:, :3, 3]
             self.model.set_scene_extent(_extent(positions))
             self.model.start_outside_cameras(positions)

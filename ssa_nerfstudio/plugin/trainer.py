@@ -34,7 +34,7 @@ from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.training.schedules import scaled
-from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device, check_length, check_settings
+from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device, check_length, check_machine, check_settings
 
 _LOG = logging.getLogger(__name__)
 
@@ -48,6 +48,11 @@ class SSATrainerConfig(TrainerConfig):
     """Photos, cameras, scene and overlay."""
     scale_schedules: bool = True
     """Scale every schedule by max_num_iterations / 30000, so that a shorter run is a complete run."""
+
+    def set_timestamp(self) -> None:
+        """Set the timestamp as upstream; ns-train calls this first, so what it would fail at is checked here."""
+        check_machine(self.machine)
+        super().set_timestamp()
 
 
 class SSATrainer(Trainer):
@@ -97,7 +102,12 @@ class SSATrainer(Trainer):
         """
         self.config.pipeline.artifacts_of = self._resumed_checkpoint()
         with self._stopped_in_one_line():
-            super().setup(test_mode)
+            try:
+                super().setup(test_mode)
+            except Exception as error:
+                if type(error).__module__.startswith("wandb.") or "COMET_API_KEY" in str(error):
+                    raise InputError(f"--vis {self.config.vis}: {error}", "or choose --vis tensorboard") from error
+                raise
         thin_event_writers(self.config.logging.steps_per_log)
         self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._report_artifact))
 
@@ -122,7 +132,8 @@ class SSATrainer(Trainer):
             super()._load_checkpoint()
             return
         if folder is None or step is not None:
-            error = self._load_one()
+            path = file if folder is None else folder / f"step-{step:09d}.ckpt"
+            error = (path and damage(path)) or self._load_one()
             if error is not None:
                 raise InputError(f"{file or folder} cannot be read ({error})", "name another checkpoint: --load-step")
             return

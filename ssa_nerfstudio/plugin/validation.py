@@ -10,6 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from ssa_nerfstudio.data.training_requirements import MIN_VIEWS
@@ -35,8 +37,23 @@ _LOWEST = {
     "sh_degree": 0,
     "sh_degree_interval": 1,
     "sparsity_weight": 0,
+    "ssim_lambda": 0,
 }
 """The lowest values of settings of the model that work."""
+
+
+_HIGHEST = {"sh_degree": 4, "ssim_lambda": 1}
+"""Highest values: of nerfstudio's spherical harmonics, and of a share."""
+_MAX_SEED = 2**32 - 1
+
+
+def check_machine(machine: MachineConfig) -> None:
+    """Refuse what nerfstudio and numpy fail at before the training is set up."""
+    if not 0 <= machine.seed <= _MAX_SEED:
+        raise InputError(f"--machine.seed must be from 0 to {_MAX_SEED}, got {machine.seed}")
+    for name in ("num_devices", "num_machines"):
+        if (value := getattr(machine, name)) < 1:
+            raise InputError(f"--machine.{name.replace('_', '-')} must be at least 1, got {value}")
 
 
 def check_length(steps: int, scale_factor: float) -> None:
@@ -79,6 +96,12 @@ def check_settings(model: ModelSettings, device: torch.device | str) -> None:
         value = getattr(model, name)
         if value is not None and not lowest <= value < math.inf:
             raise InputError(f"--pipeline.model.{name.replace('_', '-')} must be at least {lowest}, got {value}")
+    for name, highest in _HIGHEST.items():
+        if (value := getattr(model, name)) > highest:
+            raise InputError(f"--pipeline.model.{name.replace('_', '-')} must be at most {highest}, got {value}")
+    for name, value in vars(model).items():
+        if isinstance(value, float) and math.isnan(value):
+            raise InputError(f"--pipeline.model.{name.replace('_', '-')} is no number")
     if not 0 <= model.clearance < 1:
         raise InputError(f"--pipeline.model.clearance must be in [0, 1), got {model.clearance}")
     if not 0 < model.mcmc_opacity_start < 1:
@@ -113,5 +136,17 @@ def check_views(outputs: DataparserOutputs, source: Path) -> None:
         if not finite.all():
             name = outputs.image_filenames[int((~finite).nonzero()[0])]
             raise InputError(
-                f"{source}: the {what} of {name} are not finite numbers", "correct them or remove that photo"
+                f"{source}: {what} of {name} {'is' if what == 'pose' else 'are'} not of finite numbers",
+                "correct the dataset, look at the options of its reader, or remove that photo",
             )
+
+
+def check_first_resolution(cameras: Cameras, num_downscales: int) -> None:
+    """Refuse to start with photos of less than a pixel."""
+    shortest = int(min(cameras.width.min(), cameras.height.min()))
+    if 2**num_downscales > shortest:
+        raise InputError(
+            f"--pipeline.model.num-downscales {num_downscales} starts with one pixel in 2^{num_downscales}, and a side "
+            f"of a photo has {shortest}",
+            "choose a smaller number",
+        )

@@ -78,9 +78,11 @@ def read_existing_model(path: Path, photos: Path, sources: Sequence[Source]) -> 
     if any(source.videos for source in sources):
         raise InputError(f"{photos} holds videos, {path} has the poses of photos", "give the photos it was made from")
     names = {(photos / image.name).resolve(): image for image in model.images.values() if image.has_pose}
+    if not names:
+        raise InputError(f"{path} holds no photo with a pose", "give another model, or leave out --colmap")
     present = {file: names[file.resolve()] for s in sources for file in s.photos if file.resolve() in names}
     if len(present) < 2:
-        example = next(iter(sorted(image.name for image in names.values())), "none")
+        example = min(image.name for image in names.values())
         raise InputError(
             f"{len(present)} of the {len(names)} photos with a pose in {path} are in {photos} (one is {example})",
             "give the folder that COLMAP had as --image_path",

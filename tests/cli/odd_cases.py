@@ -45,6 +45,10 @@ def corpus(name: str) -> list[dict[str, Any]]:
 
 def edit_json(path: Path, case: dict[str, Any]) -> None:
     """Do to a JSON file what a case says."""
+    if "link" in case:
+        path.unlink()
+        path.symlink_to(case["link"])
+        return
     if (text := case.get("text")) is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
         return

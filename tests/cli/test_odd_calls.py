@@ -122,6 +122,7 @@ def inputs(tiny_scene, tmp_path_factory) -> dict[str, str]:
     return {
         "scene": str(shutil.copytree(tiny_scene, folder / "scene")),
         "photos": str(folder / "scene/images"),
+        "run": str(folder / "run"),
         "config": str(write_run(folder / "run", one_camera(ScreenSpaceOverlay(48, 64)))),
         "results": str(folder_of(folder / "results", runs)),
         "file": str(folder / "text.txt"),

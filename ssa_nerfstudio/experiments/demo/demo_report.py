@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from rich.table import Table
 
+from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error, write_text
 from ssa_nerfstudio.experiments.demo.comparison import Comparison, Demonstration
 from ssa_nerfstudio.workflow.html_page import render_page
 
@@ -44,9 +45,9 @@ def write_report(demonstration: Demonstration, output: Path, command: str) -> Pa
     sheet = output / "sheet.png"
     _draw_sheet(demonstration, sheet)
     results = {**demonstration.results(), "command": command}
-    (output / "results.json").write_text(json.dumps(results, indent=2) + "\n")
+    write_text(output / "results.json", json.dumps(results, indent=2) + "\n")
     page = output / "report.html"
-    page.write_text(_page(demonstration, sheet, results))
+    write_text(page, _page(demonstration, sheet, results))
     return page
 
 
@@ -74,7 +75,8 @@ def _draw_sheet(demonstration: Demonstration, path: Path) -> None:
             axis.set_xticks([])
             axis.set_yticks([])
         row[0].set_ylabel(comparison.name, fontsize=10)
-    figure.savefig(path, dpi=110)
+    with unwritable_as_input_error(path), staged_file(path) as part:
+        figure.savefig(part, format="png", dpi=110)
     plt.close(figure)
 
 

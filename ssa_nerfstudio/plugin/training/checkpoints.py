@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
 import zipfile
 import zlib
@@ -27,12 +28,21 @@ def step_of(checkpoint: Path) -> int:
 
 
 def newest_first(folder: Path) -> list[Path]:
-    """The checkpoints of a folder."""
-    return sorted((path for path in folder.glob("step-*.ckpt") if path.stem[5:].isdigit()), key=step_of, reverse=True)
+    """The checkpoints of a folder; none where there is no such folder.
+
+    Raises:
+        PermissionError: the folder may not be read, which `glob` takes for empty.
+    """
+    if not folder.is_dir():
+        return []
+    found = [path for path in folder.iterdir() if re.fullmatch(r"step-\d+\.ckpt", path.name, re.ASCII)]
+    return sorted(found, key=step_of, reverse=True)
 
 
 def damage(checkpoint: Path) -> str | None:
     """The reason why a checkpoint's file is damaged, or None. (`torch.load` compares no checksums.)"""
+    if not checkpoint.is_file():
+        return "it is no file"
     try:
         with zipfile.ZipFile(checkpoint) as archive:
             wrong = archive.testzip()

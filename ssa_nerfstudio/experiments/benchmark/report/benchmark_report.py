@@ -8,6 +8,7 @@ from collections import Counter
 from itertools import product
 from pathlib import Path
 
+from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error, write_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report import category_tables, detail_tables, difference_tables
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
@@ -27,7 +28,7 @@ def store_plan(folder: Path, command: str, benchmark: Benchmark, runs: list[Run]
     path = folder / PLANS / f"{command}-{benchmark.name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     values = {"benchmark": benchmark.name, "protocol": benchmark.protocol, "runs": [run.id for run in runs]}
-    path.write_text(json.dumps(values, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(values, indent=1) + "\n")
 
 
 def report(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
@@ -138,7 +139,8 @@ def _sheets(study: Study, folders: list[Path], output: Path) -> list[Picture]:
         if drawn is not None:
             path = output / "sheets" / f"{scene}-{effect}-{densification}-{study.steps}-e{study.effect_seed}.jpg"
             path.parent.mkdir(parents=True, exist_ok=True)
-            drawn.save(path, quality=88)
+            with unwritable_as_input_error(path), staged_file(path) as part:
+                drawn.save(part, format="JPEG", quality=88)
             pictures.append(Picture(path, f"{scene}, {effect}, {densification.upper()}, {study.title}"))
     return pictures
 

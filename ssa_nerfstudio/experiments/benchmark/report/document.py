@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ssa_nerfstudio.data.writing import write_text
 from ssa_nerfstudio.workflow.html_page import render_page
 
 _TEMPLATES = Path(__file__).parents[2] / "templates"
@@ -52,5 +53,5 @@ class Document:
             text = render_page(
                 _TEMPLATES / f"benchmark{path.suffix}", self.title, sections=self.sections, folder=folder
             )
-            path.write_text(text, encoding="utf-8")
+            write_text(path, text)
         return paths

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 
+from ssa_nerfstudio.data.writing import write_text
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Table
 from ssa_nerfstudio.experiments.benchmark.report.table_cells import HEADINGS
 
@@ -27,7 +28,7 @@ _SYMBOLS = {
 def write_latex(document: Document, path: Path) -> Path:
     """Write the tables of a document one after the other, to be pasted; they need booktabs and graphicx."""
     tables = [item for section in document.sections for item in section.contents if isinstance(item, Table)]
-    path.write_text("% \\usepackage{booktabs,graphicx}\n" + "\n".join(map(latex, tables)), encoding="utf-8")
+    write_text(path, "% \\usepackage{booktabs,graphicx}\n" + "\n".join(map(latex, tables)))
     return path
 
 

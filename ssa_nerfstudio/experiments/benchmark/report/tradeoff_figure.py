@@ -13,6 +13,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error
 from ssa_nerfstudio.experiments.benchmark.report.frontier import knee
 from ssa_nerfstudio.experiments.benchmark.report.tradeoff_curves import Curve, Subject
 
@@ -56,7 +57,9 @@ def draw(subject: Subject, folder: Path) -> list[Path]:
         legend.set_in_layout(False)
     paths = [folder / f"{subject.name}.{kind}" for kind in ("png", "svg")]
     for path in paths:
-        figure.savefig(path, dpi=130, metadata={"Date": None} if path.suffix == ".svg" else None)
+        kind = path.suffix[1:]
+        with unwritable_as_input_error(path), staged_file(path) as part:
+            figure.savefig(part, format=kind, dpi=130, metadata={"Date": None} if kind == "svg" else None)
     plt.close(figure)
     return paths
 

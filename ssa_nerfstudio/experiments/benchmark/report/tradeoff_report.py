@@ -6,6 +6,7 @@ import csv
 import shlex
 from pathlib import Path
 
+from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
 from ssa_nerfstudio.experiments.benchmark.report.frontier import Point, knee, price
@@ -147,7 +148,11 @@ def _frontier_table(subject: Subject, front: list[Point], bend: Point | None) ->
 
 
 def _write_csv(subjects: list[Subject], path: Path) -> Path:
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with (
+        unwritable_as_input_error(path),
+        staged_file(path) as part,
+        part.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow(COLUMNS)
         for subject in subjects:
