@@ -34,7 +34,14 @@ from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.training.schedules import scaled
-from ssa_nerfstudio.plugin.validation import check_checkpoint, check_device, check_length, check_machine, check_settings
+from ssa_nerfstudio.plugin.validation import (
+    check_checkpoint,
+    check_device,
+    check_length,
+    check_machine,
+    check_port,
+    check_settings,
+)
 
 _LOG = logging.getLogger(__name__)
 
@@ -52,6 +59,7 @@ class SSATrainerConfig(TrainerConfig):
     def set_timestamp(self) -> None:
         """Set the timestamp as upstream; ns-train calls this first, so what it would fail at is checked here."""
         check_machine(self.machine)
+        check_port(self.viewer.websocket_port)
         super().set_timestamp()
 
 

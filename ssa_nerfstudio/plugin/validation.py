@@ -56,6 +56,12 @@ def check_machine(machine: MachineConfig) -> None:
             raise InputError(f"--machine.{name.replace('_', '-')} must be at least 1, got {value}")
 
 
+def check_port(port: int | None) -> None:
+    """Refuse what is no port of TCP."""
+    if port is not None and not 0 < port < 2**16:
+        raise InputError(f"--viewer.websocket-port must be from 1 to {2**16 - 1}, got {port}")
+
+
 def check_length(steps: int, scale_factor: float) -> None:
     """Refuse trainings of no steps or on photos of no size."""
     if steps < 1:

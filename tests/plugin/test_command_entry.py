@@ -1,0 +1,153 @@
+"""nerfstudio's commands end in one line of ours: runs that cannot be read, and options that upstream fails at."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from pathlib import Path
+
+import pytest
+import torch
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.command_entry import report_in_one_line
+
+
+def called(entry_point: Callable[[], None]) -> None:
+    """Call what a process calls, with what the interpreter does of an exception that nobody catches."""
+    try:
+        entry_point()
+    except Exception:
+        sys.excepthook(*sys.exc_info())
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys):
+    """Call a command as its script does; the line and exit code that it ends with."""
+
+    def run(name: str, *options: str | Path) -> str:
+        (script,) = entry_points(group="console_scripts", name=name)
+        monkeypatch.setattr(sys, "argv", [name, *map(str, options)])
+        monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+        report_in_one_line()
+        with pytest.raises(SystemExit) as end:
+            called(script.load())
+        assert end.value.code == 2
+        (line,) = [line for line in capsys.readouterr().err.splitlines() if "error" in line]
+        return line.removeprefix("ssa-nerfstudio: error: ")
+
+    return run
+
+
+@pytest.mark.parametrize("content", ["", "[1, 2]", "x: [", "!!python/object:no.such.Class {}", "\x89PNG\xff", "\0"])
+def test_a_config_that_is_none(content, refused, tmp_path):
+    config = tmp_path / "config.yml"
+    config.write_bytes(content.encode("latin-1"))
+    line = refused("ns-eval", "--load-config", config)
+    assert line.startswith(f"{config} cannot be read as the config.yml of a run")
+
+
+@pytest.fixture(scope="module")
+def run(tiny_scene, tmp_path_factory, configure_training, train_and_evaluate) -> Path:
+    """A run of one step."""
+    folder = tmp_path_factory.mktemp("runs")
+    config = configure_training("ssa-splatfacto", tiny_scene, folder, 1, {"num_downscales": 0, "overlay": "off"})
+    config.set_timestamp()
+    config.save_config()
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    trainer.save_checkpoint(0)
+    return config.get_base_dir()
+
+
+@pytest.mark.parametrize("name", ["step-000000000.ckpt", "notes.txt"])
+def test_a_checkpoint_that_is_none(name, refused, run):
+    file = run / "nerfstudio_models" / name
+    before = file.read_bytes() if file.exists() else None
+    file.write_text("hello")
+    line = refused("ns-eval", "--load-config", run / "config.yml")
+    culprit = file if before else file.parent
+    assert line.startswith(f"{culprit} cannot be read as a checkpoint")
+    file.write_bytes(before) if before else file.unlink()
+
+
+def test_no_checkpoint_at_all(refused, run):
+    (file,) = (run / "nerfstudio_models").iterdir()
+    file.rename(run / "aside.ckpt")
+    assert "nerfstudio_models cannot be read as a checkpoint" in refused("ns-eval", "--load-config", run / "config.yml")
+    (run / "aside.ckpt").rename(file)
+
+
+def test_an_error_after_the_run_was_read_is_not_blamed_on_it(refused, run, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("of another kind")
+
+    monkeypatch.setattr("ssa_nerfstudio.plugin.pipeline.SSAPipeline.__init__", fail)
+    monkeypatch.setattr(sys, "__excepthook__", lambda *_: None)
+    with pytest.raises(pytest.fail.Exception):
+        refused("ns-eval", "--load-config", run / "config.yml")
+
+
+def test_memory_that_runs_out_is_said_in_one_line(refused, run, monkeypatch):
+    def fail(*_: object, **__: object) -> None:
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB. GPU 0 has")
+
+    monkeypatch.setattr("ssa_nerfstudio.plugin.pipeline.SSAPipeline.__init__", fail)
+    line = refused("ns-eval", "--load-config", run / "config.yml")
+    assert line == "memory ran out (CUDA out of memory); close other programs, or use smaller photos"
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--machine.seed", "-1"), "--machine.seed must be from 0 to 4294967295, got -1"),
+        (("--machine.seed", "99999999999"), "--machine.seed must be from 0"),
+        (("--machine.num-devices", "0"), "--machine.num-devices must be at least 1, got 0"),
+        (("--viewer.websocket-port", "99999"), "--viewer.websocket-port must be from 1 to 65535, got 99999"),
+    ],
+)
+def test_options_that_upstream_fails_at(options, says, refused, tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert says in refused("ns-train", "ssa-splatfacto", "--data", tiny_scene, "--vis", "tensorboard", *options)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("reader", "says"),
+    [
+        (("--eval-mode", "fraction", "--train-split-fraction", "5"), "--train-split-fraction 5 leaves no two of 15"),
+        (("--eval-mode", "fraction", "--train-split-fraction", "nan"), "--train-split-fraction nan leaves no two"),
+        (("--eval-mode", "interval", "--eval-interval", "1"), "--eval-interval must be at least 2, got 1"),
+        (("--eval-mode", "filename"), "test_0000.png has neither train nor eval in its name"),
+    ],
+)
+def test_splits_that_cannot_be_made(reader, says, refused, broken_scene, tmp_path):
+    from cli.odd_cases import edit_json
+
+    edit_json(broken_scene / "transforms.json", {"unsplit": True})
+    words = ("--data", broken_scene, "--vis", "tensorboard", "--output-dir", tmp_path / "out")
+    assert says in refused("ns-train", "ssa-splatfacto", *words, "nerfstudio-data", *reader)
+
+
+def test_a_dataset_of_another_kind(refused, tiny_scene, tmp_path):
+    words = ("--data", tiny_scene, "--vis", "tensorboard", "--output-dir", tmp_path / "out", "colmap")
+    line = refused("ns-train", "ssa-splatfacto", *words)
+    assert line.startswith(f"nerfstudio cannot read {tiny_scene} (Colmap path")
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"sh_degree": 9}, "sh-degree must be at most 4, got 9"),
+        ({"ssim_lambda": 5.0}, "ssim-lambda must be at most 1, got 5.0"),
+        ({"ssim_lambda": float("nan")}, "ssim-lambda must be at least 0, got nan"),
+        ({"densify_grad_thresh": float("nan")}, "densify-grad-thresh is no number"),
+        ({"num_downscales": 6}, r"num-downscales 6 starts with one pixel in 2\^6, and a side of a photo has 48"),
+    ],
+)
+def test_settings_that_upstream_fails_at(settings, says, configure_training, tiny_scene, tmp_path):
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"overlay": "off", **settings})
+    config.set_timestamp()
+    with pytest.raises(InputError, match=says):
+        config.setup(local_rank=0, world_size=1).setup()
