@@ -11,6 +11,8 @@ import time
 from pathlib import Path
 
 import pytest
+from experiments.benchmark.made_results import all_results, folder_of
+from export.small_checkpoints import write_run
 
 SSA = (sys.executable, "-m", "ssa_nerfstudio")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -70,6 +72,87 @@ def test_a_full_disk(blocks, tiny_scene, tmp_path):
     assert done.returncode == 2
     assert ("out cannot be written" if blocks else "temporary directory") in in_one_line(done.stderr)
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+def test_a_report_on_a_full_disk(tmp_path):
+    """Of the files of a report, those that are there are whole."""
+    runs = [each for each in all_results() if each.run.scene == "attic" and each.run.seed == 0]
+    folder_of(tmp_path / "results", runs)
+    command = 'ulimit -f 1; exec "$0" -m ssa_nerfstudio report results --output out'
+    done = subprocess.run(["bash", "-c", command, sys.executable], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "out/report.md cannot be written" in in_one_line(done.stderr)
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+@pytest.mark.parametrize("stream", ["2>/dev/full", "2>&-"])
+def test_errors_that_nobody_can_read(stream, tmp_path):
+    command = f'exec "$0" -m ssa_nerfstudio bench nothing --output out {stream}'
+    done = subprocess.run(["bash", "-c", command, sys.executable], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
+
+
+def test_a_result_that_nobody_reads(tmp_path):
+    reader, writer = os.pipe()
+    os.close(reader)
+    config = write_run(tmp_path / "run", None)
+    words = ["export-splats", "--load-config", config, "--output-dir", tmp_path / "out"]
+    done = subprocess.run([*SSA, *words], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=60)
+    os.close(writer)
+    assert (done.returncode, "Traceback" in done.stderr) == (141, False)
+    assert (tmp_path / "out/splat.ply").is_file()
+
+
+def test_a_working_directory_that_was_deleted(tiny_scene, tmp_path):
+    command = 'mkdir x; cd x; rmdir ../x; exec "$0" -m ssa_nerfstudio detect --data "$1"'
+    words = ["bash", "-c", command, sys.executable, tiny_scene]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "the working directory cannot be used (No such file or directory)" in in_one_line(done.stderr)
+
+
+def test_too_little_memory_for_its_libraries(tiny_scene, tmp_path):
+    command = 'ulimit -v 1500000; exec "$0" -m ssa_nerfstudio detect --data "$1"'
+    words = ["bash", "-c", command, sys.executable, tiny_scene]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "free memory" in in_one_line(done.stderr)
+
+
+def without_privileges() -> list[str]:
+    """What precedes a command that files' permissions hold for: root's privileges pass over them."""
+    if os.geteuid():
+        return []
+    if shutil.which("setpriv") is None:
+        pytest.skip("root without setpriv may read every file")
+    rights = "-dac_override,-dac_read_search"
+    return ["setpriv", "--bounding-set", rights, "--inh-caps", rights]
+
+
+@pytest.mark.parametrize(
+    ("closed", "words", "says"),
+    [
+        ("scene/images", "detect --data scene --output out", "scene/images/test_0000.png: Permission denied"),
+        ("scene/transforms.json", "detect --data scene --output out", "transforms.json cannot be read (Permission"),
+        ("scene/images/train_0003.png", "detect --data scene --output out", "train_0003.png cannot be read"),
+        ("run/nerfstudio_models", "export-splats --load-config run/config.yml --output-dir out", "run/nerfstudio_mod"),
+        ("run", "export-splats --load-config run/config.yml --output-dir out", "run/config.yml: Permission denied"),
+        ("here", "detect --data scene --output here/out", "here/out"),
+    ],
+)
+def test_what_may_not_be_read_or_written(closed, words, says, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    write_run(tmp_path / "run", None)
+    (tmp_path / "here").mkdir()
+    (tmp_path / closed).chmod(0)
+    command = [*without_privileges(), *SSA, *words.split()]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    (tmp_path / closed).chmod(0o700)
+    assert done.returncode == 2
+    (line,) = [line for line in done.stderr.splitlines() if line.startswith("ssa-nerfstudio: error: ")]
+    assert says in line
+    assert "Permission denied" in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_name_that_is_no_text(tmp_path):
