@@ -22,6 +22,18 @@ if TYPE_CHECKING:
 
 STAGES = ("detect", "process", "train")
 """Stages whose commands' options follow `--STAGE.`."""
+_ITS_OWN = {
+    "detect": {"data": "PHOTOS", "output": "--output", "json": "OUTPUT/detection/detection.json"},
+    "process": {"train": "PHOTOS", "output": "--output"},
+    "train": {
+        "data": "PHOTOS",
+        "pipeline.datamanager.data": "PHOTOS",
+        "max-num-iterations": "--steps",
+        **dict.fromkeys(("output-dir", "experiment-name", "method-name", "timestamp"), "--output"),
+        **dict.fromkeys(("load-dir", "load-step", "load-checkpoint", "load-config"), "the same command, to continue"),
+    },
+}
+"""Options of the stages that `ssa run` sets, and what is used instead."""
 
 
 @dataclass
@@ -51,6 +63,10 @@ class Command:
             InputError: as `arguments.read`.
         """
         own, forwarded = arguments.split_forwarded(options, STAGES)
+        for stage, words in zip(STAGES, forwarded, strict=True):
+            for name in (word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")):
+                if name in _ITS_OWN[stage]:
+                    raise InputError(f"--{stage}.{name} is set by ssa run", f"use {_ITS_OWN[stage][name]}")
         files = [word for word in own if not word.startswith("-") and Path(word).is_file()]
         if len(files) > 1:
             raise InputError(f"PHOTOS is one folder or video, not {len(files)} files", f"give {Path(files[0]).parent}")

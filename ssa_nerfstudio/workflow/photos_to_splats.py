@@ -79,13 +79,16 @@ def stages(plan: Plan) -> list[Stage]:
     asked = plan.choices
     made = []
     if plan.process is not None:
-        made = [Stage("process", partial(_process, plan, plan.process), asked["process"])]
+        process = partial(_process, plan, plan.process)
+        made = [Stage("process", process, asked["process"], leaves=(plan.data,), repeatable=False)]
+    splats = plan.output / SPLATS, plan.output / COMPRESSED
+    config = config_file(plan.training)
     return [
-        Stage("detect", partial(_detect, plan), asked["detect"]),
+        Stage("detect", partial(_detect, plan), asked["detect"], leaves=(plan.output / DETECTION / VERDICTS,)),
         *made,
-        Stage("train", partial(_train, plan), asked["train"], bound=True),
-        Stage("evaluate", partial(_evaluate, plan)),
-        Stage("export", partial(_export, plan)),
+        Stage("train", partial(_train, plan), asked["train"], bound=True, leaves=(config,), repeatable=False),
+        Stage("evaluate", partial(_evaluate, plan), leaves=(plan.output / EVALUATION,)),
+        Stage("export", partial(_export, plan), leaves=splats),
     ]
 
 

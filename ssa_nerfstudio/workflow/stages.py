@@ -37,6 +37,10 @@ class Stage:
     """What it depends on, JSON values by the name of the option."""
     bound: bool = False
     """Whether the choices are fixed as soon as it has begun, not only when it is done."""
+    leaves: tuple[Path, ...] = ()
+    """Files and folders that are there when it is done."""
+    repeatable: bool = True
+    """Whether it can be done again, with the same outcome for later stages, where something it left is gone."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +170,14 @@ def run_stages(stages: Sequence[Stage], record: RunRecord, display: StageDisplay
 
     Raises:
         SSAError: of a stage.
-        InputError: a stage was begun with other choices.
+        InputError: a stage was begun with other choices, or what it left is gone and it cannot be repeated.
     """
     record.check(stages)
     for stage in stages:
-        earlier = stage.name in record.stages
+        gone = [path for path in stage.leaves if not path.exists()]
+        earlier = stage.name in record.stages and not (gone and stage.repeatable)
+        if earlier and gone:
+            raise InputError(f"{gone[0]}, which the run has made, is gone", "put it back, or choose another --output")
         if not earlier:
             display.begin(stage.name)
             record.begin(stage)

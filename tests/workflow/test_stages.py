@@ -69,6 +69,31 @@ def test_what_is_done_is_not_repeated(tmp_path, counted):
     assert second.parts == ["b", ("b", "half", 1, 2), "c", ("c", "half", 1, 2)]
 
 
+def test_what_was_deleted_is_made_again_or_missed(tmp_path):
+    folder, worked = tmp_path / "run", []
+    folder.mkdir()
+
+    def again(repeatable: bool = True) -> None:
+        def do(on_progress) -> Result:
+            worked.append("a")
+            (folder / "a.txt").touch()
+            return Result("done")
+
+        stage = Stage("a", do, leaves=(folder / "a.txt",), repeatable=repeatable)
+        run_stages([stage], RunRecord(folder / "run.json"), Shown())
+
+    again()
+    again()
+    assert worked == ["a"]
+    (folder / "a.txt").unlink()
+    again()
+    assert worked == ["a", "a"]
+    (folder / "a.txt").unlink()
+    with pytest.raises(InputError, match=r"a.txt, which the run has made, is gone; put it back"):
+        again(repeatable=False)
+    assert worked == ["a", "a"]
+
+
 def asked(folder: Path, fails: bool = False, bound: bool = False, **choices) -> None:
     """Run one stage that was asked for something."""
 
