@@ -74,6 +74,7 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
     terminal_messages.show_warnings()
     warnings.simplefilter("ignore", FutureWarning)  # raised by libraries at import; no user can act on them
     warnings.filterwarnings("ignore", ".*The TBB threading layer")  # numba's, about a library of the system
+    warnings.filterwarnings("ignore", category=UserWarning, module=r"PIL\.")  # about metadata that is not read
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
