@@ -7,13 +7,15 @@ other by linear regression: the training's own problem, solved on the points alo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, calm_areas
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 ROUNDS = 8
@@ -81,9 +83,10 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
     observed, point, pixel = samples.color, samples.point, samples.pixel
     colors = _initial_colors(samples, deviation)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
+    areas = [torch.from_numpy(area).to(pixel.device) for area in calm_areas(deviation[..., 0].cpu().numpy())]
     layers = expected
     prior = torch.ones_like(layers[..., :1])
-    residual = observed - colors[point]
+    residual = _initial_residual(samples, colors[point], mean)
     seen_by = torch.bincount(point, minlength=samples.points)[point]
     uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
     for round_ in range(ROUNDS):
@@ -103,6 +106,8 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
         )
         # float64, because colors at a pixel may be equal within rounding, and its block then is all but singular.
         sums = _sums(pixel, (precision * moments).double(), height * width).reshape(height, width, 9)
+        if round_ == ROUNDS // 2:
+            expected = _expected_behind(areas, expected, layers, sums[..., 0], mean)
         if round_ >= ROUNDS // 2:
             prior = 1 / (PRIOR_SCALE**2 + (layers - expected).square().amax(dim=-1, keepdim=True))
         layers = _solve(sums, across, down, prior, expected, layers)
@@ -119,6 +124,43 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
     return LayerEstimate(layers[..., :1], layers[..., 1:])
 
 
+def _initial_residual(samples: PointSamples, behind: Tensor, mean: Tensor) -> Tensor:
+    """Differences [S, 3] from the points' colors, and where all of those disagree from the mean of the photos.
+
+    Behind what is opaque every sample is an outlier to a clear pixel. Robust weights would then silence all of them,
+    and the prior would take the pixel for clear. So a pixel starts as either, by the sum of the absolute differences
+    around it.
+    """
+    height, width = samples.size
+    clear, constant = samples.color - behind, samples.color - mean.reshape(-1, 3)[samples.pixel]
+    excess = (constant.abs() - clear.abs()).sum(dim=-1, keepdim=True)
+    around = local_mean(_sums(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
+    return torch.where(around.reshape(-1, 1)[samples.pixel] < 0, constant, clear)
+
+
+def _expected_behind(areas: Sequence[Tensor], expected: Tensor, layers: Tensor, count: Tensor, mean: Tensor) -> Tensor:
+    """T and B [h, w, 4] that the sparse prior expects: calm areas whose samples show nothing of the scene are opaque.
+
+    An area is calm because the photos vary there at most MAX_OPAQUE_DEVIATION times as much as elsewhere. An artifact
+    is the reason only if its transmittance is no larger. If it is larger, what is behind is plain.
+
+    Args:
+        areas: flat indices of the pixels of each.
+        expected: elsewhere.
+        layers: T and B as estimated without that prior, [h, w, 4].
+        count: weight of the samples [h, w].
+        mean: of the photos, [h, w, 3].
+    """
+    transmittance, weight = layers[..., 0].flatten(), count.flatten()
+    behind = expected.reshape(-1, 4).clone()
+    opaque = nn.functional.pad(mean.reshape(-1, 3), (1, 0))
+    for area in areas:
+        total = weight[area].sum()
+        if total > 0 and (weight[area] * transmittance[area]).sum() <= MAX_OPAQUE_DEVIATION * total:
+            behind[area] = opaque[area].to(behind)
+    return behind.reshape(expected.shape)
+
+
 def _sums(index: Tensor, values: Tensor, count: int) -> Tensor:
     """Sum values [S, C] over equal indices in [0, count): [count, C]."""
     return values.new_zeros(count, values.shape[1]).index_add_(0, index, values)
@@ -131,7 +173,7 @@ def _initial_colors(samples: PointSamples, deviation: Tensor) -> Tensor:
     """
     variance = deviation.flatten().square()
     weight = (variance / variance.median().clamp_min(1e-12)).clamp_max(1.0)[samples.pixel].double() + 1e-3
-    sums = torch.nn.functional.pad(weight.cumsum(0), (1, 0))
+    sums = nn.functional.pad(weight.cumsum(0), (1, 0))
     points = torch.arange(samples.points, device=weight.device)
     first = torch.searchsorted(samples.point, points)
     last = torch.searchsorted(samples.point, points, right=True)

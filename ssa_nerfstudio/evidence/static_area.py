@@ -47,7 +47,7 @@ class EnclosedAreas:
     def from_edges(cls, edges: np.ndarray, statistics: ImageStatistics) -> EnclosedAreas:
         """Find the areas that edges, uint8 [h, w], enclose."""
         deviation = reduced(statistics.deviation().float(), statistics.brightness.reduction)[..., 0].cpu().numpy()
-        low = deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), HALF_GRAY_LEVEL)
+        low = low_deviation(deviation)
         enclosed = _with_edge_outline(low.astype(np.uint8), cv2.dilate(edges, _NEIGHBORS, iterations=2))
         return cls(statistics, edges, deviation, low, enclosed)
 
@@ -88,6 +88,19 @@ class EnclosedAreas:
         enlarged = cv2.resize(layer, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_NEAREST)
         missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]))
         return torch.from_numpy(np.pad(enlarged, missing, mode="edge") > 0)
+
+
+def low_deviation(deviation: np.ndarray) -> np.ndarray:
+    """Where views vary so little that an opaque artifact may cover the pixel: bool, given the deviation [h, w]."""
+    return deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), HALF_GRAY_LEVEL)
+
+
+def calm_areas(deviation: np.ndarray) -> list[np.ndarray]:
+    """Connected areas of `low_deviation`, of at least MIN_AREA: flat indices of each one's pixels."""
+    count, labels = cv2.connectedComponents(low_deviation(deviation).astype(np.uint8), connectivity=4)
+    order = np.argsort(labels, axis=None, kind="stable")
+    areas = np.split(order, np.searchsorted(labels.ravel()[order], np.arange(1, count)))[1:]
+    return [area for area in areas if len(area) >= MIN_AREA]
 
 
 def _with_edge_outline(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:

@@ -16,10 +16,10 @@ BRIGHTEST = 0.6
 CLEAR = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(HEIGHT, WIDTH, 4)
 
 
-def disc(softness: float = 0.1) -> Tensor:
+def disc(softness: float = 0.1, radius: float = 0.5) -> Tensor:
     """[H, W, 1]: 1 in a disc, 0 outside."""
     y, x = torch.meshgrid(torch.linspace(-1, 1, HEIGHT), torch.linspace(-1, 1, WIDTH), indexing="ij")
-    return torch.sigmoid((0.5 - torch.hypot(x - 0.2, y)) / softness)[..., None]
+    return torch.sigmoid((radius - torch.hypot(x - 0.2, y)) / softness)[..., None]
 
 
 def hatching() -> Tensor:
@@ -93,13 +93,53 @@ def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> Non
     assert (found.transmittance - transmittance)[disc() > 0.99].abs().mean() < 0.1
 
 
+def where(samples: PointSamples, kept: Tensor) -> PointSamples:
+    """The samples at pixels where `kept` [H, W, 1] is True."""
+    kept = kept.flatten()[samples.pixel]
+    return PointSamples(samples.point[kept], samples.pixel[kept], samples.color[kept], samples.points, samples.size)
+
+
+def test_what_hides_most_of_the_frame_softly_is_no_outlier() -> None:
+    """An operator below a 360 camera: half of all samples show him, and none of them what is behind."""
+    transmittance, addition = film(disc(0.05, radius=0.9), (0.25, 0.2, 0.15))
+    found = estimate_layers(*observe(transmittance, addition, views=14, points=50), CLEAR)
+    assert found.transmittance[transmittance < 0.1].mean() < 0.05
+    assert found.transmittance[transmittance > 0.9].mean() > 0.95
+
+
+def test_a_calm_area_that_hides_the_scene_wherever_points_tell_hides_it_everywhere() -> None:
+    """Points are seen near the rim of the disc alone."""
+    transmittance, addition = film(disc(0.02), (0.25, 0.2, 0.15))
+    samples, mean, deviation = observe(transmittance, addition, views=14, points=50)
+    core = disc(0.02, radius=0.3) > 0.5
+    found = estimate_layers(where(samples, ~core), mean, deviation, CLEAR)
+    assert found.transmittance[core].mean() < 0.05
+
+
+def test_a_film_over_a_plain_part_of_the_scene_is_not_taken_for_opaque() -> None:
+    """A path that stays in the middle of the frame, all of one color: photos hardly vary there, yet it is seen."""
+    plain, color, through = disc(0.02)[..., 0] > 0.5, torch.tensor([0.4, 0.35, 0.3]), 0.8
+    samples, mean, deviation = observe(*film(torch.full((HEIGHT, WIDTH, 1), 1 - through), (0.2, 0.2, 0.2)), wrong=0.0)
+    seen = plain.flatten()[samples.pixel]
+    generator = torch.Generator().manual_seed(2)
+    noise = 0.02 * torch.randn(len(seen), 3, generator=generator)
+    shown = through * color + (1 - through) * 0.2
+    # Points of the path are others than those beside it.
+    point = torch.where(seen, samples.points + samples.point, samples.point)
+    observed = torch.where(seen[:, None], shown + noise, samples.color)
+    order = np.lexsort((observed.sum(dim=-1).numpy(), point.numpy()))
+    path = PointSamples(point[order], samples.pixel[order], observed[order], 2 * samples.points, samples.size)
+    mean[plain], deviation[plain] = shown, 0.02
+    found = estimate_layers(path, mean, deviation, CLEAR)
+    assert found.transmittance[plain].min() > 0.6
+
+
 def test_without_samples_the_layers_are_as_expected() -> None:
     """A pixel that no point was seen at takes what its surroundings say, or else what is expected."""
     expected = CLEAR.clone()
     expected[:, :20] = torch.tensor([0.0, 0.3, 0.2, 0.1])
     samples, *_ = observe(*ARTIFACTS["none"])
-    here = samples.pixel % WIDTH >= 24
-    part = PointSamples(samples.point[here], samples.pixel[here], samples.color[here], samples.points, samples.size)
+    part = where(samples, (torch.arange(WIDTH) >= 24).expand(HEIGHT, WIDTH))
     mean = torch.full((HEIGHT, WIDTH, 3), 0.5)
     mean[:, :20] = torch.tensor([0.3, 0.2, 0.1])
     found = estimate_layers(part, mean, torch.full((HEIGHT, WIDTH, 1), 0.3), expected)
