@@ -78,13 +78,15 @@ class Detection:
         return self.verdict == "none" and self.p_value <= SIGNIFICANCE
 
 
-def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> Detection:
+def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0, known: bool = False) -> Detection:
     """Test whether the views have a static artifact.
 
     Args:
         statistics: of all views of one camera, in the order of the capture.
         draws: shifted captures in the null distribution.
         seed: of the shifts; global random state is neither used nor changed.
+        known: whether other photos have shown that an artifact is there, so that its edges, if there are any, need
+            be neither significant nor many.
     """
     views = int(statistics.views.max())
     edges = measure_edges(statistics)
@@ -99,7 +101,8 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0) -> De
     excess = shares[0] - fine, shares[1] - coarse
     interval = clopper_pearson(exceeding, draws)
     enclosed = EnclosedAreas.from_edges(edges.mask, statistics)
-    if p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_OPAQUE_SHARE):
+    few = p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_OPAQUE_SHARE)
+    if few and not (known and edges.mask.any()):
         return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere, nowhere)
     mask = enclosed.mask()
     coverage = float(mask.float().mean())

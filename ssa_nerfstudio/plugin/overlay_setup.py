@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,7 @@ from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 
 from ssa_nerfstudio.cameras.camera_names import camera_names
-from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order
+from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order, interval_at
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
@@ -25,6 +27,9 @@ from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.decisions import tell
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
+
+NamedPhoto = tuple[str, dict[str, Any]]
+"""Path relative to the dataset, and the photo with its mask as the datamanager caches them."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ def learned_overlays(
     groups: list[int],
     sizes: list[tuple[int, int]],
     gains: torch.Tensor | None = None,
+    withheld: Callable[[int], list[NamedPhoto]] = lambda group: [],
 ) -> list[LearnedGroup]:
     """Make an overlay for each camera group, or for each of its intervals where the artifact changes.
 
@@ -62,11 +68,13 @@ def learned_overlays(
         groups: each photo's group.
         sizes: height and width of each group's frame.
         gains: of the photos [V, 3], where their exposure varies; colors of points are compared without them.
+        withheld: further photos of a group behind the same artifact, not to be trained on. Where the others show no
+            artifact, they help to decide whether there is one, and nothing else.
     """
-    learned = []
+    learned: list[LearnedGroup] = []
     photos_of = [[index for index, at in enumerate(groups) if at == camera] for camera in range(len(sizes))]
     called = camera_names([[names[index] for index in members] for members in photos_of])
-    for members, size, camera in zip(photos_of, sizes, called, strict=True):
+    for group, (members, size, camera) in enumerate(zip(photos_of, sizes, called, strict=True)):
         name = "the photos" if len(sizes) == 1 else f"the photos of {camera}"
         members.sort(key=lambda index: capture_order(names[index]))
         statistics, intervals = None, [members]
@@ -77,30 +85,74 @@ def learned_overlays(
                 intervals = [members[start:end] for start, end in pairwise(ends)]
         if len(intervals) > 1:
             _report_changes([names[interval[0]] for interval in intervals[1:]], name)
+        starts = [BEGINNING, *(names[interval[0]] for interval in intervals[1:])]
         for number, interval in enumerate(intervals):
-            views, part = [photos[index] for index in interval], name
+            part = _Part(
+                name,
+                [(names[index], photos[index]) for index in interval],
+                cameras[torch.tensor(interval)],
+                None if gains is None else gains[interval],
+                size,
+                partial(_of_interval, withheld, group, starts, number),
+            )
             if len(intervals) > 1:
-                part = f"{name} from {Path(names[interval[0]]).name} to {Path(names[interval[-1]]).name}"
-                statistics = _statistics(views, part)
-            own = None if gains is None else gains[interval]
-            view_cameras = cameras[torch.tensor(interval)]
-            overlay = _learned_overlay(config, statistics, views, view_cameras, points, size, part, own)
-            learned.append(LearnedGroup(interval, names[interval[0]] if number else BEGINNING, camera, overlay))
+                first, last = Path(names[interval[0]]).name, Path(names[interval[-1]]).name
+                part = replace(part, name=f"{name} from {first} to {last}")
+                statistics = _statistics(part.images, part.name)
+            overlay = _learned_overlay(config, part, statistics, points)
+            learned.append(LearnedGroup(interval, starts[number], camera, overlay))
     return learned
+
+
+@dataclass(frozen=True)
+class _Part:
+    """The photos of a camera, or of one of its intervals."""
+
+    name: str
+    """For messages."""
+    photos: list[NamedPhoto]
+    """In the order of the capture."""
+    cameras: Cameras
+    gains: torch.Tensor | None
+    size: tuple[int, int]
+    withheld: Callable[[], list[NamedPhoto]]
+
+    @property
+    def images(self) -> list[dict[str, Any]]:
+        return [photo for _, photo in self.photos]
+
+    def artifact_in_all(self) -> bool:
+        """Whether there is one in these photos and the withheld ones together."""
+        withheld = self.withheld()
+        everything = sorted([*self.photos, *withheld], key=lambda photo: capture_order(photo[0]))
+        return bool(withheld) and detect(_statistics([photo for _, photo in everything], self.name)).verdict != "none"
+
+
+def _of_interval(
+    withheld: Callable[[int], list[NamedPhoto]], group: int, starts: list[str], number: int
+) -> list[NamedPhoto]:
+    return [photo for photo in withheld(group) if interval_at(photo[0], starts) == number]
 
 
 def _learned_overlay(
     config: ModelSettings,
+    part: _Part,
     statistics: ImageStatistics | None,
-    photos: list[dict[str, Any]],
-    cameras: Cameras,
     points: torch.Tensor | None,
-    size: tuple[int, int],
-    name: str,
-    gains: torch.Tensor | None,
+    known: str = "",
 ) -> ScreenSpaceOverlay | None:
+    """The overlay of a part; None where there is no artifact, under overlay "auto".
+
+    Args:
+        config: the model's.
+        part: which.
+        statistics: of its photos; None where none are needed.
+        points: of the scene.
+        known: what else has shown that there is an artifact.
+    """
+
     def overlay(adds_light: bool) -> ScreenSpaceOverlay:
-        return ScreenSpaceOverlay(*size, config.overlay_downscale, adds_light)
+        return ScreenSpaceOverlay(*part.size, config.overlay_downscale, adds_light)
 
     light = config.overlay_light == "on"
     if statistics is None:
@@ -109,16 +161,20 @@ def _learned_overlay(
     if config.overlay == "on" and config.overlay_start == "statistics":
         initialize(papers := overlay(light), statistics)
         return papers
-    detection, guide = detect(statistics), guide_of(statistics)
+    detection, guide = detect(statistics, known=bool(known)), guide_of(statistics)
     found = None
     if points is not None and (config.overlay == "auto" or by_points):
-        samples = sample_points(points.to(photos[0]["image"].device), views_of(photos, cameras, gains))
+        device = part.images[0]["image"].device
+        samples = sample_points(points.to(device), views_of(part.images, part.cameras, part.gains))
         found = estimate(samples, guide, detection.opaque) if len(samples.point) else None
     if config.overlay == "auto":
         share = 0.0 if found is None else found.share()
-        _report(detection, share, name)
-        if detection.verdict == "none" and share < MIN_SHARE:
+        if detection.verdict == "none" and share < MIN_SHARE and not known:
+            if part.artifact_in_all():
+                return _learned_overlay(config, part, statistics, points, "with the test photos")
+            _report(detection, share, part.name)
             return None
+        _report(detection, share, part.name, known)
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide)
@@ -179,13 +235,13 @@ def _report_changes(starts: list[str], name: str) -> None:
     )
 
 
-def _report(detection: Detection, share: float, name: str) -> None:
+def _report(detection: Detection, share: float, name: str, known: str = "") -> None:
     """Tell the verdict in one line, with the option that overrides it."""
     name = name[0].upper() + name[1:]
-    if detection.verdict != "none" or share >= MIN_SHARE:
+    if detection.verdict != "none" or share >= MIN_SHARE or known:
         what = f"{detection.verdict}, {detection.coverage:.1%}" if detection.verdict != "none" else f"soft, {share:.1%}"
         tell(
-            f"{name} have a static artifact ({what} of the frame): training with an overlay. "
+            f"{name} have a static artifact{known and f', {known}'} ({what} of the frame): training with an overlay. "
             "(--pipeline.model.overlay off trains without.)"
         )
         return

@@ -14,17 +14,18 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
 from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.evidence.point_samples import PointSamples
-from ssa_nerfstudio.plugin.camera_matching import describe_lenses, fisheye_lenses, group_cameras
+from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, fisheye_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
 from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
-from ssa_nerfstudio.plugin.overlay_setup import given_overlays, learned_overlays
+from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
@@ -127,9 +128,8 @@ class SSAPipeline(VanillaPipeline):
     ) -> dict[str, Any]:
         """Metrics over all test views, as upstream; with a warning where the test photos carry the artifact."""
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
-        parser = self.config.datamanager.dataparser
-        ours = len(self.model.artifacts) > 0 and isinstance(parser, NerfstudioDataParserConfig)
-        if ours and not Transforms.read(_source(self.config)).test_photos_are_clean:
+        transforms = self._transforms() if len(self.model.artifacts) else None
+        if transforms is not None and not transforms.test_photos_are_clean:
             _LOG.warning(
                 "the test photos carry the artifact, so psnr, ssim and flip of the clean render say little; read "
                 "composite_psnr, or state clean photos as test_filenames in transforms.json"
@@ -153,7 +153,10 @@ class SSAPipeline(VanillaPipeline):
         else:
             views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
             gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
-            learned = learned_overlays(self.config.model, photos, names, views, self._points(), groups, sizes, gains)
+            learned = learned_overlays(
+                self.config.model, photos, names, views, self._points(), groups, sizes, gains,
+                lambda group: self._withheld_photos(keys[group]),
+            )  # fmt: skip
             overlays = [each.overlay for each in learned]
             starts, cameras = [each.start for each in learned], [each.camera for each in learned]
             keys = keys[[groups[each.members[0]] for each in learned]]
@@ -161,6 +164,27 @@ class SSAPipeline(VanillaPipeline):
             groups = [group_of[view] for view in range(len(photos))]
         first = [groups.index(g) for g in range(len(keys))]
         artifacts.assign(overlays, keys, groups, lenses[first], starts, cameras)
+
+    def _withheld_photos(self, key: torch.Tensor) -> list[NamedPhoto]:
+        """Test photos of the camera with this key of `group_cameras` that have its artifact: stated ones are clean."""
+        transforms = self._transforms()
+        if transforms is None or transforms.stated_split("test") or transforms.stated_split("val"):
+            return []
+        photos, dataset = self.datamanager.cached_eval, self.datamanager.eval_dataset
+        trained_on = {*self.datamanager.photo_names(self.datamanager.train_dataset)}
+        found = []
+        for name, photo, own in zip(
+            self.datamanager.photo_names(dataset), photos, describe(dataset.cameras), strict=True
+        ):
+            same = torch.equal(own[:2], key[:2]) and same_intrinsics(own.numpy(), key.numpy())
+            if same and name not in trained_on:
+                found.append((name, photo))
+        return found
+
+    def _transforms(self) -> Transforms | None:
+        """The dataset's file; None where another parser than nerfstudio's reads it."""
+        ours = isinstance(self.config.datamanager.dataparser, NerfstudioDataParserConfig)
+        return Transforms.read(_source(self.config)) if ours else None
 
 
 def _source(config: SSAPipelineConfig) -> Path:

@@ -160,7 +160,7 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
 def missed_artifacts(plan: Plan, layers: Sequence[ArtifactLayers]) -> list[str]:
     """What detection found and the training has not learned, by the number of cameras: names may differ.
 
-    Training tests its own photos, which are fewer than those of the first stage.
+    Training tests undistorted photos, of a 360 degree camera the faces.
     """
     groups = json.loads((plan.output / DETECTION / VERDICTS).read_text(encoding="utf-8"))["groups"]
     found = [group["name"] for group in groups if group["verdict"] != "none"]
