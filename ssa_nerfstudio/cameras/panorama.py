@@ -126,3 +126,33 @@ def compose(pictures: Sequence[tuple[Face, np.ndarray]], width: int) -> tuple[np
         total += weight * seen.reshape(total.shape)
         weights += weight
     return total / np.maximum(weights, np.float32(1e-6)), weights[..., 0] > 0
+
+
+def hidden_by_neighbors(face: Face, neighbors: Sequence[tuple[Face, np.ndarray]]) -> np.ndarray:
+    """Layers of other faces where these overlap with a face, in the face's frame; of several the least transmittance.
+
+    Args:
+        face: which.
+        neighbors: other faces of the same size, each with its layers T and B, float32 [size, size, 4].
+
+    Returns:
+        Layers [size, size, 4]; clear (1, 0, 0, 0) where no other face looks.
+    """
+    axis = (np.arange(face.size) + 0.5 - face.size / 2) / face.focal
+    x, y = np.meshgrid(axis, axis)
+    # Others look no further than the tangent of half their angle of view.
+    border = np.maximum(np.abs(x), np.abs(y)) >= min(
+        (2 * other.focal / other.size for other, _ in neighbors), default=1
+    )
+    directions = np.stack([x[border], y[border], np.ones(border.sum())], axis=-1) @ face.from_panorama
+    at_border = np.tile(np.array([1, 0, 0, 0], np.float32), (len(directions), 1))
+    for other, layers in neighbors:
+        positions, depth = other.pixels(directions)
+        inside = (depth > 0) & (positions > 0).all(axis=-1) & (positions < other.size).all(axis=-1)
+        column, row = np.where(inside[:, None], positions, 0).astype(int).T
+        seen = layers[row, column]
+        more = inside & (seen[:, 0] < at_border[:, 0])
+        at_border[more] = seen[more]
+    found = np.tile(np.array([1, 0, 0, 0], np.float32), (face.size, face.size, 1))
+    found[border] = at_border
+    return found

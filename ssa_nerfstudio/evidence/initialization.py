@@ -82,7 +82,12 @@ def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide:
     reduction = working_reduction(overlay.height, overlay.width)
     layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition), reduction).clamp(0, 1)
     present = enlarged(present, overlay.height, overlay.width, reduction) > 0
-    layers = torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    initialize_as(overlay, torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
+
+
+@torch.no_grad()
+def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor) -> None:
+    """Initialize an overlay with layers T and B [H, W, 4] in its frame; it is changed in place."""
     transmittance, addition = _at_overlay_resolution(layers, overlay).split((1, 3), dim=-1)
     if overlay.adds_light:
         overlay.initialize(addition, 1 - transmittance, transmittance)

@@ -16,6 +16,7 @@ from rich.progress import track
 
 from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order, interval_at
+from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
@@ -25,6 +26,7 @@ from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.decisions import tell
+from ssa_nerfstudio.plugin.face_overlaps import joined_overlays
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
@@ -56,6 +58,7 @@ def learned_overlays(
     sizes: list[tuple[int, int]],
     gains: torch.Tensor | None = None,
     withheld: Callable[[int], list[NamedPhoto]] = lambda group: [],
+    faces: list[Face] | None = None,
 ) -> list[LearnedGroup]:
     """Make an overlay for each camera group, or for each of its intervals where the artifact changes.
 
@@ -70,6 +73,7 @@ def learned_overlays(
         gains: of the photos [V, 3], where their exposure varies; colors of points are compared without them.
         withheld: further photos of a group behind the same artifact, not to be trained on. Where the others show no
             artifact, they help to decide whether there is one, and nothing else.
+        faces: of a panorama, that the groups are; None where they are none.
     """
     learned: list[LearnedGroup] = []
     photos_of = [[index for index, at in enumerate(groups) if at == camera] for camera in range(len(sizes))]
@@ -101,6 +105,15 @@ def learned_overlays(
                 statistics = _statistics(part.images, part.name)
             overlay = _learned_overlay(config, part, statistics, points)
             learned.append(LearnedGroup(interval, starts[number], camera, overlay))
+    if faces is not None and len(learned) == len(faces):
+        joined = joined_overlays(faces, [each.overlay for each in learned], config.overlay_downscale)
+        for index, overlay in joined.items():
+            if learned[index].overlay is None:
+                tell(
+                    f"The artifact reaches into the photos of {learned[index].camera} from the face beside them: "
+                    "training with an overlay there, too."
+                )
+            learned[index] = replace(learned[index], overlay=overlay)
     return learned
 
 

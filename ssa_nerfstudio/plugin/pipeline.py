@@ -16,12 +16,14 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
+from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, fisheye_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
+from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
@@ -153,9 +155,12 @@ class SSAPipeline(VanillaPipeline):
         else:
             views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
             gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
+            transforms = self._transforms()
+            panorama = None if transforms is None else read_panorama(transforms)
+            faces = None if panorama is None else faces_of(panorama, keys)
             learned = learned_overlays(
                 self.config.model, photos, names, views, self._points(), groups, sizes, gains,
-                lambda group: self._withheld_photos(keys[group]),
+                lambda group: self._withheld_photos(keys[group]), faces,
             )  # fmt: skip
             overlays = [each.overlay for each in learned]
             starts, cameras = [each.start for each in learned], [each.camera for each in learned]

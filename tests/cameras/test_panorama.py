@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ssa_nerfstudio.cameras.groups import group_frames
-from ssa_nerfstudio.cameras.panorama import FACE_NAMES, compose, cut, panorama_faces
+from ssa_nerfstudio.cameras.panorama import FACE_NAMES, compose, cut, hidden_by_neighbors, panorama_faces
 
 WIDTH = 256
 LOOKS = {
@@ -75,3 +75,19 @@ def test_each_face_is_a_camera_of_its_own_and_a_pixel_is_about_one_of_the_panora
         # Also at an eighth of the size.
         assert max(group_frames(np.array(frames) / 8)) == 5
         assert faces[0].focal == pytest.approx(width / (2 * np.pi), rel=0.05)
+
+
+@pytest.mark.parametrize("face", panorama_faces(WIDTH), ids=lambda face: face.name)
+def test_neighbors_know_what_hides_the_scene_at_a_faces_border(face):
+    """Layers on the sphere, opaque around one corner where three faces meet, cut into all faces."""
+    near = directions(WIDTH) @ (np.array([1, 1, -1]) / np.sqrt(3))  # right, down and back
+    transmittance = 1 - 1 / (1 + np.exp(-(near - 0.9) / 0.02))
+    layers = np.stack([transmittance, *[0.5 * (1 - transmittance)] * 3], axis=-1).astype(np.float32)
+    faces = panorama_faces(WIDTH)
+    own = {each.name: cut(layers, each) for each in faces}
+    found = hidden_by_neighbors(face, [(each, own[each.name]) for each in faces if each != face])
+    hidden = found[..., 0] < 0.5
+    assert hidden.any() == (face.name in ("right", "down", "back"))
+    assert np.abs(found - own[face.name])[hidden].max(initial=0) < 0.15
+    assert hidden.mean() < 0.05, "within the overlap alone, two degrees along each border"
+    assert (found[len(found) // 2, len(found) // 2] == [1, 0, 0, 0]).all()
