@@ -76,6 +76,7 @@ def learned_overlays(
         faces: of a panorama, that the groups are; None where they are none.
     """
     learned: list[LearnedGroup] = []
+    verdicts: dict[int, str] = {}  # of faces, which may change
     photos_of = [[index for index, at in enumerate(groups) if at == camera] for camera in range(len(sizes))]
     called = camera_names([[names[index] for index in members] for members in photos_of])
     for group, (members, size, camera) in enumerate(zip(photos_of, sizes, called, strict=True)):
@@ -98,6 +99,7 @@ def learned_overlays(
                 None if gains is None else gains[interval],
                 size,
                 partial(_of_interval, withheld, group, starts, number),
+                tell if faces is None else partial(verdicts.__setitem__, len(learned)),
             )
             if len(intervals) > 1:
                 first, last = Path(names[interval[0]]).name, Path(names[interval[-1]]).name
@@ -109,11 +111,13 @@ def learned_overlays(
         joined = joined_overlays(faces, [each.overlay for each in learned], config.overlay_downscale)
         for index, overlay in joined.items():
             if learned[index].overlay is None:
-                tell(
+                verdicts[index] = (
                     f"The artifact reaches into the photos of {learned[index].camera} from the face beside them: "
-                    "training with an overlay there, too."
+                    "training with an overlay. (--pipeline.model.overlay off trains without.)"
                 )
             learned[index] = replace(learned[index], overlay=overlay)
+    for verdict in verdicts.values():
+        tell(verdict)
     return learned
 
 
@@ -129,6 +133,8 @@ class _Part:
     gains: torch.Tensor | None
     size: tuple[int, int]
     withheld: Callable[[], list[NamedPhoto]]
+    say: Callable[[str], None]
+    """Takes the verdict in one line."""
 
     @property
     def images(self) -> list[dict[str, Any]]:
@@ -185,9 +191,9 @@ def _learned_overlay(
         if detection.verdict == "none" and share < MIN_SHARE and not known:
             if part.artifact_in_all():
                 return _learned_overlay(config, part, statistics, points, "with the test photos")
-            _report(detection, share, part.name)
+            part.say(_in_words(detection, share, part.name))
             return None
-        _report(detection, share, part.name, known)
+        part.say(_in_words(detection, share, part.name, known))
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide)
@@ -248,19 +254,18 @@ def _report_changes(starts: list[str], name: str) -> None:
     )
 
 
-def _report(detection: Detection, share: float, name: str, known: str = "") -> None:
-    """Tell the verdict in one line, with the option that overrides it."""
+def _in_words(detection: Detection, share: float, name: str, known: str = "") -> str:
+    """The verdict in one line, with the option that overrides it."""
     name = name[0].upper() + name[1:]
     if detection.verdict != "none" or share >= MIN_SHARE or known:
         what = f"{detection.verdict}, {detection.coverage:.1%}" if detection.verdict != "none" else f"soft, {share:.1%}"
-        tell(
+        return (
             f"{name} have a static artifact{known and f', {known}'} ({what} of the frame): training with an overlay. "
             "(--pipeline.model.overlay off trains without.)"
         )
-        return
     reason = "too few to tell" if detection.views < MIN_VIEWS else f"p = {detection.p_value:.2g}"
     reason += ", too few static edges to report" if detection.too_few_edges else ""
-    tell(
+    return (
         f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"
     )

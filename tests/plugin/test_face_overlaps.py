@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
+from nerfstudio.cameras.cameras import Cameras
 
 from ssa_nerfstudio.cameras.panorama import cut, panorama_faces
 from ssa_nerfstudio.data.panorama_entry import Panorama
 from ssa_nerfstudio.evidence.initialization import initialize_as
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.face_overlaps import faces_of, joined_overlays
+from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
+from ssa_nerfstudio.plugin.overlay_setup import learned_overlays
 
 WIDTH = 512
 FACES = panorama_faces(WIDTH)
@@ -47,6 +51,35 @@ def test_what_reaches_over_the_border_of_a_face_starts_in_its_neighbors():
         assert transmittance[hidden].mean() < 0.1
         assert addition[hidden].mean() == pytest.approx(COLOR, abs=0.03)
         assert transmittance[clear].mean() > 0.98
+
+
+def test_a_strip_too_small_to_be_found_gets_an_overlay_and_one_line(capsys):
+    """Panoramas that vary in everything but an operator below: only the face that looks down has enough of him."""
+    rng, views = np.random.default_rng(0), 12
+    hidden = np.linspace(90, -90, WIDTH // 2)[:, None, None] < -44.0
+    coat = (60 + 60 * (np.arange(WIDTH // 2) // 4 % 2))[:, None, None]
+    photos, names, groups = [], [], []
+    for view in range(views):
+        scene = cv2.resize(rng.integers(0, 255, (32, 64, 3), np.uint8), (WIDTH, WIDTH // 2))
+        panorama = np.where(hidden, coat, scene).astype(np.uint8)
+        for group, face in enumerate(FACES):
+            photos.append({"image": torch.from_numpy(cut(panorama, face))})
+            names.append(f"images/frame_{face.name}_{view:05d}.png")
+            groups.append(group)
+    size = FACES[0].size
+    cameras = Cameras(torch.eye(4)[:3].repeat(len(photos), 1, 1), 100.0, 100.0, size / 2, size / 2, size, size)
+    config = SSASplatfactoModelConfig()
+    learned = learned_overlays(config, photos, names, cameras, None, groups, [(size, size)] * 6, faces=list(FACES))
+    assert {face.name for face, each in zip(FACES, learned, strict=True) if each.overlay is None} == {"up"}
+    told = " ".join(capsys.readouterr().out.split())
+    assert told.count("--pipeline.model.overlay") == 6, "one line for each face"
+    assert "The artifact reaches into the photos of frame_left from the face beside them" in told
+    assert "The photos of frame_down have a static artifact (opaque" in told
+    assert "The photos of frame_up show no static artifact" in told
+    alone = learned_overlays(config, photos, names, cameras, None, groups, [(size, size)] * 6)
+    found = {face.name for face, each in zip(FACES, alone, strict=True) if each.overlay is not None}
+    assert found < {"front", "right", "back", "left", "down"}, "by their own photos"
+    assert "down" in found
 
 
 @pytest.mark.parametrize("highest", [-60.0, -90.0], ids=["inside of its face", "nowhere"])
