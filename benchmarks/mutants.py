@@ -42,18 +42,22 @@ KNOWN = ("killed", "segfault", "suspicious")
 """Verdicts that stand; others are tried again, because tests may have been added since."""
 
 
+ALL = "all"
+"""The whole package: every folder of it that has tests, each changed and tested by itself."""
+
+
 @dataclass
 class Command:
     """Change a folder of the package one line at a time, and write which changes its tests do not notice."""
 
     room: str = "overlay"
-    """Folder below ssa_nerfstudio, and below tests: overlay, evidence, plugin/training, ..."""
+    """Folder below ssa_nerfstudio, and below tests: overlay, evidence, plugin/training, ...; or all of them: all."""
     output: Path = Path("build/mutants")
     """Folder to work in. A stopped run continues; survivors and mutants of changed functions are tried anew."""
     children: int = len(os.sched_getaffinity(0))
     """Mutants tried at once."""
     sample: int = 0
-    """Try so many, drawn at random from all of the folder; 0: all."""
+    """Try so many, drawn at random from all changes that are asked for; 0: all."""
     seed: int = 0
     """Of the sample."""
 
@@ -63,39 +67,71 @@ class Command:
         Raises:
             InputError: there is no such folder, or its tests fail without a mutant.
         """
-        for kind in ("ssa_nerfstudio", "tests"):
-            if not (ROOT / kind / self.room).is_dir():
-                raise InputError(f"there is no folder {kind}/{self.room}", "name one below both")
-        folder = self.output.resolve() / self.room
-        _copy(folder, self.room)
-        copy = folder / "mutants"
-        # What is tested comes before what is installed, also in processes that tests start.
-        environment = {**os.environ, "PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-
-        def told(*words: str) -> str:
-            command = [sys.executable, "-m", "mutmut", *words]
-            return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout
-
-        def found() -> dict[str, str]:
-            return dict(re.findall(r"^ +(\S+): (.+)$", told("results", "--all", "true"), re.MULTILINE))
-
-        subprocess.run([sys.executable, "-c", GENERATE], cwd=folder, check=True, stdout=subprocess.DEVNULL)
-        before = found()
-        names = sorted(before)
-        if self.sample:
-            names = random.Random(self.seed).sample(names, min(self.sample, len(names)))
-        todo = [name for name in names if before[name] not in KNOWN]
-        if todo:
-            command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(self.children), *todo]
-            if subprocess.run(command, cwd=folder, env=environment).returncode:
-                raise InputError(f"the tests of {self.room} fail as they are", f"pytest tests/{self.room} says why")
-        after = found()
-        tried = {name: after[name] for name in names}
-        changes = {name: told("show", name) for name, status in tried.items() if status in ("survived", "timeout")}
+        rooms = [Room(name, self.output.resolve() / name) for name in self._names()]
+        before = {room: room.prepared() for room in rooms}
+        every = [(room, change) for room in rooms for change in sorted(before[room])]
+        chosen = random.Random(self.seed).sample(every, min(self.sample, len(every))) if self.sample else every
+        tried: dict[str, str] = {}
+        shown: dict[str, str] = {}
+        for room in rooms:
+            changes = [change for of, change in chosen if of == room]
+            if todo := [change for change in changes if before[room][change] not in KNOWN]:
+                room.try_changes(todo, self.children)
+            after = room.found() if todo else before[room]
+            tried |= {change: after[change] for change in changes}
+            shown |= {name: room.told("show", name) for name in changes if after[name] in ("survived", "timeout")}
         page = self.output / f"{self.room.replace('/', '-')}.md"
         drawn = f" SAMPLE={self.sample} SEED={self.seed}" if self.sample else ""
-        page.write_text(_page(f"{self.room}{drawn}", tried, changes))
+        page.write_text(_page(f"{self.room}{drawn}", tried, shown, len(every)))
         print(page)
+
+    def _names(self) -> list[str]:
+        package, tests = ROOT / "ssa_nerfstudio", ROOT / "tests"
+        if self.room == ALL:
+            return sorted(
+                folder.name for folder in package.iterdir() if any((tests / folder.name).glob("**/test_*.py"))
+            )
+        for folder in (package, tests):
+            if not (folder / self.room).is_dir():
+                raise InputError(f"there is no folder {folder.name}/{self.room}", f"name one below both, or {ALL}")
+        return [self.room]
+
+
+@dataclass(frozen=True)
+class Room:
+    """A folder of the package whose changes its own tests are to notice."""
+
+    name: str
+    folder: Path
+    """Where a copy of the package lies, and mutmut keeps what it found."""
+
+    def prepared(self) -> dict[str, str]:
+        """Copy the package, make all changes of the folder, and return what is known of each."""
+        _copy(self.folder, self.name)
+        subprocess.run([sys.executable, "-c", GENERATE], cwd=self.folder, check=True, stdout=subprocess.DEVNULL)
+        return self.found()
+
+    def told(self, *words: str) -> str:
+        """What a command of mutmut prints."""
+        command = [sys.executable, "-m", "mutmut", *words]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, check=True).stdout
+
+    def found(self) -> dict[str, str]:
+        """The verdict on each change."""
+        return dict(re.findall(r"^ +(\S+): (.+)$", self.told("results", "--all", "true"), re.MULTILINE))
+
+    def try_changes(self, names: list[str], children: int) -> None:
+        """Run the tests of each.
+
+        Raises:
+            InputError: they fail without a change.
+        """
+        # What is tested comes before what is installed, also in processes that tests start.
+        path = str(self.folder / "mutants")
+        environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+        command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(children), *names]
+        if subprocess.run(command, cwd=self.folder, env=environment).returncode:
+            raise InputError(f"the tests of {self.name} fail as they are", f"pytest tests/{self.name} says why")
 
 
 def _copy(folder: Path, room: str) -> None:
@@ -114,14 +150,14 @@ def _copy(folder: Path, room: str) -> None:
     (folder / "pyproject.toml").write_text(settings)
 
 
-def _page(room: str, found: dict[str, str], changes: dict[str, str]) -> str:
+def _page(room: str, found: dict[str, str], changes: dict[str, str], total: int) -> str:
     counts = Counter(found.values())
     noticed, reached = sum(counts[status] for status in NOTICED), len(found) - counts["no tests"]
     lines = [
         f"# Mutants of {room}",
-        f"`make mutants ROOM={room}`: {noticed} of {reached} noticed ({noticed / max(1, reached):.1%}), "
-        f"{counts['timeout']} of them by running out of time; {counts['no tests']} more are in functions that no test "
-        "of the folder calls on this machine.",
+        f"`make mutants ROOM={room}`, of {total} changes: {noticed} of {reached} noticed "
+        f"({noticed / max(1, reached):.1%}), {counts['timeout']} of them by running out of time; {counts['no tests']} "
+        "more are in functions that no test of the folder calls on this machine.",
         *(f"## {name}: {found[name]}\n\n```diff\n{change.strip()}\n```" for name, change in changes.items()),
     ]
     return "\n\n".join(lines) + "\n"
