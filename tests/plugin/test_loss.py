@@ -22,6 +22,7 @@ def trainer(tiny_scene, tmp_path_factory, configure_training):
     config.set_timestamp()
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
+    trainer.pipeline.model.step_cb(trainer.optimizers, 0)  # as before the first step
     return trainer
 
 
