@@ -6,9 +6,12 @@ points is ours (docs/method.md).
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
@@ -57,9 +60,14 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor) -> LayerEstim
     reduction = working_reduction(*guide.shape[:2])
     # Photos that vary nowhere show no scene.
     hidden = (opaque.to(guide.device) | (guide[..., 3] < HALF_GRAY_LEVEL).all()).to(guide)[..., None]
-    expected = torch.cat([1 - hidden, hidden * guide[..., :3]], dim=-1)
-    both = reduced(torch.cat([guide, expected], dim=-1), reduction).to(samples.color.device)
-    return estimate_layers(samples, *both.split((3, 1, 4), dim=-1))
+    photos = torch.cat([guide, hidden * guide[..., :3], 1 - hidden], dim=-1)
+    photos = reduced(photos, reduction).to(samples.color.device)
+    falloff = estimate_falloff(samples)
+    photos[..., :7] /= falloff
+    mean, deviation, addition, transmittance = photos.split((3, 1, 3, 1), dim=-1)
+    behind = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
+    found = estimate_layers(behind, mean, deviation, torch.cat([transmittance, addition], dim=-1))
+    return replace(found, falloff=falloff)
 
 
 @torch.no_grad()
@@ -80,9 +88,10 @@ def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide:
     # A pixel wider, for the soft rim.
     present = nn.functional.max_pool2d((opacity > MIN_OPACITY).float().permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
     reduction = working_reduction(overlay.height, overlay.width)
-    layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition), reduction).clamp(0, 1)
+    falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)
+    layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition) / falloff, reduction).clamp(0, 1)
     present = enlarged(present, overlay.height, overlay.width, reduction) > 0
-    initialize_as(overlay, torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
+    initialize_as(overlay, falloff * torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
 
 
 @torch.no_grad()

@@ -42,16 +42,19 @@ _GRAY_LEVEL = 1 / 255
 
 @dataclass(frozen=True)
 class LayerEstimate:
-    """Estimated layers at the working resolution."""
+    """Estimated layers at the working resolution: I = F (T C + B)."""
 
     transmittance: Tensor
     """T [h, w, 1] in [0, 1]."""
     addition: Tensor
     """B [h, w, 3] in [0, 1]."""
+    falloff: Tensor
+    """F [h, w, 1] in (0, 1]: of the lens, see `falloff.estimate_falloff`."""
 
     def share(self) -> float:
         """Share of the frame that is hidden or lit by more than CERTAIN_OPACITY."""
-        return float((smallest_matte(self.transmittance, self.addition) > CERTAIN_OPACITY).float().mean())
+        opacity = smallest_matte(self.falloff * self.transmittance, self.falloff * self.addition)
+        return float((opacity > CERTAIN_OPACITY).float().mean())
 
     def adds_light(self) -> bool:
         """Whether the artifact adds light and hides nothing.
@@ -121,7 +124,7 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
         others = (total[:, 3:][point] - seen[:, 3:]).clamp_min(1e-6)
         uncertainty = transmitted.square() / others
         residual = observed - transmitted * colors[point] - added
-    return LayerEstimate(layers[..., :1], layers[..., 1:])
+    return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]))
 
 
 def _initial_residual(samples: PointSamples, behind: Tensor, mean: Tensor) -> Tensor:

@@ -52,6 +52,15 @@ class PointSamples:
     """Number of points."""
     size: tuple[int, int]
     """Height and width of the working frame."""
+    view: Tensor
+    """[S] int64: index of the view."""
+
+    def ordered(self) -> PointSamples:
+        """Sorted by point, then by brightness."""
+        order = torch.argsort(self.color.sum(dim=-1))
+        order = order[torch.argsort(self.point[order], stable=True)]
+        point, pixel, color, view = (each[order] for each in (self.point, self.pixel, self.color, self.view))
+        return PointSamples(point, pixel, color, self.points, self.size, view)
 
 
 def working_reduction(height: int, width: int) -> int:
@@ -74,7 +83,7 @@ def sample_points(points: Tensor, views: Sequence[View]) -> PointSamples:
     reduction = working_reduction(height, width)
     size = height // reduction, width // reduction
     found = []
-    for view in views:
+    for number, view in enumerate(views):
         image = _reduced(view.image[..., :3], reduction, points.device)
         image = image if view.gain is None else image / view.gain.to(image)
         index, place = _visible(points, view, reduction, size)
@@ -82,11 +91,9 @@ def sample_points(points: Tensor, views: Sequence[View]) -> PointSamples:
             seen = _reduced(view.mask.reshape(height, width, 1) != 0, reduction, points.device)[..., 0] == 1
             kept = seen.flatten()[place]
             index, place = index[kept], place[kept]
-        found.append((index, place, image.reshape(-1, 3)[place]))
-    point, pixel, color = (torch.cat(parts) for parts in zip(*found, strict=True))
-    order = torch.argsort(color.sum(dim=-1))
-    order = order[torch.argsort(point[order], stable=True)]
-    return PointSamples(point[order], pixel[order], color[order], len(points), size)
+        found.append((index, place, image.reshape(-1, 3)[place], torch.full_like(index, number)))
+    point, pixel, color, shown_by = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return PointSamples(point, pixel, color, len(points), size, shown_by).ordered()
 
 
 def regular_subset(points: Tensor, views: int) -> Tensor:

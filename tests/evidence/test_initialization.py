@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -114,7 +116,7 @@ def estimated(height: int, width: int, transmittance: float, addition: tuple[flo
     """Layers on the left half, nothing on the right half but a little noise."""
     T, B = torch.full((height, width, 1), 0.97), torch.full((height, width, 3), 0.02)
     T[:, : width // 2], B[:, : width // 2] = transmittance, torch.tensor(addition)
-    return LayerEstimate(T, B)
+    return LayerEstimate(T, B, torch.ones_like(T))
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
@@ -145,3 +147,17 @@ def test_additive_light_starts_without_a_matte() -> None:
     torch.testing.assert_close(overlay.matte(), torch.full((12, 16, 1), 0.01))
     assert (overlay.color()[:, :8] - torch.tensor([0.4, 0.3, 0.2])).abs().max() < 1e-5
     assert (overlay.evidence == 1).all()
+
+
+def test_a_falloff_multiplies_what_is_behind_it_and_is_kept_where_that_is_noise() -> None:
+    _, statistics = capture(12, 16)
+    overlay = ScreenSpaceOverlay(12, 16)
+    falloff = torch.linspace(0.5, 0.9, 16).expand(12, 16)[..., None]
+    behind = estimated(12, 16, 0.6, (0.3, 0.2, 0.1))
+    initialize_from(overlay, replace(behind, falloff=falloff), guide_of(statistics))
+    T, B = (layer.detach() for layer in overlay.layers())
+    torch.testing.assert_close(T[:, :7], 0.6 * falloff[:, :7], atol=1e-5, rtol=0)
+    assert (B[:, :7] - falloff[:, :7] * torch.tensor([0.3, 0.2, 0.1])).abs().max() < 0.02
+    torch.testing.assert_close(T[:, 10:], falloff[:, 10:], atol=1e-5, rtol=0)
+    assert behind.share() == 0.5
+    assert replace(behind, falloff=torch.full_like(falloff, 0.6)).share() == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -61,7 +63,8 @@ def observe(
     seen = transmittance.reshape(-1, 1)[pixel] * behind + addition.reshape(-1, 3)[pixel]
     seen = (seen + 0.02 * torch.randn(seen.shape, generator=generator)).clamp(0, 1)
     order = np.lexsort((seen.sum(dim=-1).numpy(), point.numpy()))
-    samples = PointSamples(point[order], pixel[order], seen[order], points, (HEIGHT, WIDTH))
+    view = torch.arange(views).repeat_interleave(points)[order]
+    samples = PointSamples(point[order], pixel[order], seen[order], points, (HEIGHT, WIDTH), view)
     photos = transmittance * BRIGHTEST * torch.rand(200, HEIGHT, WIDTH, 3, generator=generator) + addition
     return samples, photos.mean(dim=0), photos.std(dim=0).amax(dim=-1, keepdim=True)
 
@@ -88,7 +91,7 @@ def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> Non
     pixel, color = samples.pixel.clone(), samples.color.clone()
     pixel[stuck] = places[torch.randint(len(places), (int(stuck.sum()),), generator=generator)]
     color[stuck] = addition.reshape(-1, 3)[pixel[stuck]]
-    moved = PointSamples(samples.point, pixel, color, samples.points, samples.size)
+    moved = replace(samples, pixel=pixel, color=color)
     found = estimate_layers(moved, mean, deviation, CLEAR)
     assert (found.transmittance - transmittance)[disc() > 0.99].abs().mean() < 0.1
 
@@ -96,7 +99,7 @@ def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> Non
 def where(samples: PointSamples, kept: Tensor) -> PointSamples:
     """The samples at pixels where `kept` [H, W, 1] is True."""
     kept = kept.flatten()[samples.pixel]
-    return PointSamples(samples.point[kept], samples.pixel[kept], samples.color[kept], samples.points, samples.size)
+    return replace(samples, **{name: getattr(samples, name)[kept] for name in ("point", "pixel", "color", "view")})
 
 
 def test_what_hides_most_of_the_frame_softly_is_no_outlier() -> None:
@@ -128,7 +131,9 @@ def test_a_film_over_a_plain_part_of_the_scene_is_not_taken_for_opaque() -> None
     point = torch.where(seen, samples.points + samples.point, samples.point)
     observed = torch.where(seen[:, None], shown + noise, samples.color)
     order = np.lexsort((observed.sum(dim=-1).numpy(), point.numpy()))
-    path = PointSamples(point[order], samples.pixel[order], observed[order], 2 * samples.points, samples.size)
+    path = PointSamples(
+        point[order], samples.pixel[order], observed[order], 2 * samples.points, samples.size, samples.view[order]
+    )
     mean[plain], deviation[plain] = shown, 0.02
     found = estimate_layers(path, mean, deviation, CLEAR)
     assert found.transmittance[plain].min() > 0.6
@@ -153,7 +158,7 @@ def test_any_number_of_samples_gives_finite_layers(seed: int) -> None:
     for count in (1, 2, 30):
         point = torch.randint(5, (count,), generator=generator).sort().values
         pixel = torch.randint(HEIGHT * WIDTH, (count,), generator=generator)
-        samples = PointSamples(point, pixel, torch.rand(count, 3, generator=generator), 5, (HEIGHT, WIDTH))
+        samples = PointSamples(point, pixel, torch.rand(count, 3, generator=generator), 5, (HEIGHT, WIDTH), point)
         flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
         found = estimate_layers(samples, flat, torch.zeros(HEIGHT, WIDTH, 1), CLEAR)
         for layer in (found.transmittance, found.addition):

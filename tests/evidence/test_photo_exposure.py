@@ -29,7 +29,7 @@ def scene(spread: float, place: str = "photo", matte: float = 0.0, outliers: flo
         shown = shown + 0.01 * torch.randn(POINTS, 3, generator=generator)
         wrong = torch.rand(POINTS, 1, generator=generator) < outliers
         shown = torch.where(wrong, torch.rand(POINTS, 3, generator=generator), shown).clamp(0, 1)
-        views.append(PointSamples(torch.arange(POINTS), pixel, shown, POINTS, SIZE))
+        views.append(PointSamples(torch.arange(POINTS), pixel, shown, POINTS, SIZE, torch.zeros(POINTS).long()))
     return views, [layers] * VIEWS, log_gains
 
 
@@ -48,7 +48,8 @@ def test_one_exposure_is_found_as_such():
 
 def test_a_photo_without_samples_has_the_mean_exposure():
     samples, _, _ = scene(0.0)
-    nothing = PointSamples(torch.zeros(0).long(), torch.zeros(0).long(), torch.zeros(0, 3), POINTS, SIZE)
+    none = torch.zeros(0).long()
+    nothing = PointSamples(none, none, torch.zeros(0, 3), POINTS, SIZE, none)
     found = relative_gains([nothing, *samples])
     assert found.isfinite().all()
     assert found[0].abs().max() < 0.01

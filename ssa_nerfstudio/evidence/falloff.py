@@ -1,0 +1,96 @@
+"""Falloff of light from the middle of the frame to its corners (vignetting), from the scene's points.
+
+A point has one color in all photos, so where log I changes with its pixel, something in front changes. A lens darkens
+by the distance from the frame's center alone. Shading, reflections and other artifacts have no reason to: what of the
+same smoothness is not radial says how much of the radial part may be theirs. docs/method.md derives it.
+"""
+
+from __future__ import annotations
+
+import torch
+from scipy.special import fdtrc
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE
+from ssa_nerfstudio.evidence.photo_exposure import DAMPING, MIN_SCALE, OUTLIER_SCALE, ROUNDS, USABLE
+from ssa_nerfstudio.evidence.point_samples import PointSamples
+
+SIGNIFICANCE = 0.001
+"""Chance that modes of equal variance have as large a radial share: below it there is a falloff."""
+MAX_SAMPLES = 20_000
+"""Of more, those of a regular subset of the points are used: a falloff has three parameters."""
+MAX_VIEWS = 128
+"""Of more, a regular subset is used."""
+RADIAL_MODES = 3
+_GRAY_LEVEL = 1 / 255
+
+
+@torch.no_grad()
+def estimate_falloff(samples: PointSamples) -> Tensor:
+    """Estimate the transmittance of a falloff by robust regression, with the points' colors and views' gains unknown.
+
+    Args:
+        samples: of the scene's points.
+
+    Returns:
+        [h, w, 1] in (0, 1], of the working size: 1 in the clearest CLEAR_SHARE of the frame, and everywhere unless the
+        falloff is significant.
+    """
+    height, width = samples.size
+    modes = _modes(height, width).to(samples.color.device)
+    radial = modes[:, :RADIAL_MODES]
+    found = _regression(samples, modes).square()
+    other = found[RADIAL_MODES:].mean()
+    ratio = float(found[:RADIAL_MODES].mean() / other) if other > 0 else 0.0
+    log_transmittance = modes.new_zeros(height * width)
+    if fdtrc(RADIAL_MODES, modes.shape[1] - RADIAL_MODES, ratio) < SIGNIFICANCE:
+        # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
+        log_transmittance = radial @ _regression(samples, radial)
+    clearest = log_transmittance.kthvalue(max(1, round((1 - CLEAR_SHARE) * height * width))).values
+    if log_transmittance[height // 2 * width + width // 2] < clearest:
+        # What is darkest in the middle is in front of the lens.
+        return samples.color.new_ones(height, width, 1)
+    return (log_transmittance - clearest).exp().clamp(_GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+
+
+def _modes(height: int, width: int) -> Tensor:
+    """Polynomials of the position, orthonormal over the frame [h w, 15], float64: r^2, r^4, r^6 and all others up to
+    the fourth degree."""
+    y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
+    z = torch.complex(*torch.broadcast_tensors(x, y[:, None])).flatten() / max(height, width)
+    squared = z.abs().square()
+    turning = [z, z**2, z * squared, z**3, z**2 * squared, z**4]
+    modes = [squared, squared**2, squared**3, *(part for mode in turning for part in (mode.real, mode.imag))]
+    stacked = torch.stack(modes, dim=-1)
+    return torch.linalg.qr(stacked - stacked.mean(dim=0)).Q
+
+
+def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
+    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, with Cauchy's weights."""
+    brightness, every = samples.color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
+    usable = (brightness < USABLE[1]) & (samples.view % every == 0)
+    usable &= samples.point % (int(usable.sum()) // MAX_SAMPLES + 1) == 0
+    if not usable.any():
+        return modes.new_zeros(modes.shape[1])
+    point = samples.point[usable].unique(return_inverse=True)[1]
+    shown_by = torch.nn.functional.one_hot(samples.view[usable] // every)
+    columns = torch.cat([modes[samples.pixel[usable]], shown_by.to(modes)], dim=-1)
+    values = brightness[usable].clamp_min(_GRAY_LEVEL).log()[:, None]
+    # The modes only need to be regular.
+    damping = torch.full(columns.shape[1:], DAMPING, dtype=columns.dtype, device=columns.device)
+    damping[: modes.shape[1]] = 1e-9
+    weight, solution = torch.ones_like(values), torch.zeros_like(damping)
+    for _ in range(ROUNDS):
+        total = _of_points(weight, point)
+        centered = columns - (_of_points(weight * columns, point) / total)[point]
+        rest = values - (_of_points(weight * values, point) / total)[point]
+        weighted = weight * centered
+        solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
+        rest = rest - centered @ solution
+        weight = 1 / (1 + (rest / (OUTLIER_SCALE * (1.48 * rest.abs().median() + MIN_SCALE))).square())
+    return solution.flatten()[: modes.shape[1]]
+
+
+def _of_points(values: Tensor, point: Tensor) -> Tensor:
+    """Sum values [S, C] of each point [P, C]."""
+    return values.new_zeros(int(point.max()) + 1, values.shape[1]).index_add_(0, point, values)

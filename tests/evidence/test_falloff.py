@@ -1,0 +1,61 @@
+"""Falloff of light, estimated from points: synthetic tracks whose falloff is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.falloff import estimate_falloff
+from ssa_nerfstudio.evidence.point_samples import PointSamples
+
+HEIGHT, WIDTH, POINTS, VIEWS = 36, 48, 400, 40
+Y, X = torch.meshgrid(torch.linspace(-0.6, 0.6, HEIGHT), torch.linspace(-0.8, 0.8, WIDTH), indexing="ij")
+FALLOFF = 1 - 0.7 * (X.square() + Y.square()) ** 1.5
+"""1 in the center, 0.3 in the corners."""
+NOT_RADIAL = {
+    "nothing": torch.ones(HEIGHT, WIDTH),
+    "light from the left": 1 - 0.3 * (X + 0.8),
+    "a dark lower edge": 0.2 + 0.8 * torch.sigmoid((0.4 - Y) / 0.05),
+    "an operator in the middle of the lower face": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X, Y) - 0.3) / 0.05),
+    "a finger": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X - 0.7, Y - 0.5) - 0.4) / 0.05),
+}
+
+
+def samples(transmittance: Tensor, wrong: float = 0.1, seed: int = 0) -> PointSamples:
+    """Points that wander through the frame, photos of several gains, and samples that show something else."""
+    generator = torch.Generator().manual_seed(seed)
+    color = 0.1 + 0.6 * torch.rand(POINTS, 1, generator=generator)
+    start = torch.rand(POINTS, 1, 2, generator=generator) - 0.5
+    way = torch.rand(POINTS, 1, 2, generator=generator) - 0.5
+    place = start + way * torch.linspace(-1, 1, VIEWS)[:, None]
+    place = ((place + 0.5) * torch.tensor([HEIGHT, WIDTH])).long()
+    inside = ((place >= 0) & (place < torch.tensor([HEIGHT, WIDTH]))).all(dim=-1)
+    point, view = inside.nonzero(as_tuple=True)
+    pixel = (place[..., 0] * WIDTH + place[..., 1])[inside]
+    gain = (0.1 * torch.randn(VIEWS, generator=generator)).exp()[view, None]
+    shown = gain * transmittance.flatten()[pixel, None] * color[point]
+    other = torch.rand(shown.shape, generator=generator)
+    shown = torch.where(torch.rand(shown.shape, generator=generator) < wrong, other, shown)
+    shown = (shown + 0.01 * torch.randn(len(point), 3, generator=generator)).clamp(0, 1)
+    return PointSamples(point, pixel, shown, POINTS, (HEIGHT, WIDTH), view)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_falloff_is_found_up_to_the_clearest_part_of_the_frame(seed: int) -> None:
+    found = estimate_falloff(samples(FALLOFF, seed=seed))[..., 0]
+    clearest = FALLOFF.flatten().quantile(0.8)
+    assert (found - (FALLOFF / clearest).clamp_max(1)).abs().max() < 0.04
+
+
+@pytest.mark.parametrize("name", NOT_RADIAL)
+def test_what_is_not_radial_or_not_darkest_outside_is_no_falloff(name: str) -> None:
+    assert (estimate_falloff(samples(NOT_RADIAL[name])) == 1).all()
+
+
+def test_samples_that_say_nothing_find_nothing() -> None:
+    every = samples(FALLOFF)
+    assert (estimate_falloff(replace(every, color=torch.ones_like(every.color))) == 1).all()
+    assert (estimate_falloff(replace(every, pixel=torch.zeros_like(every.pixel))) == 1).all()
