@@ -18,8 +18,8 @@ def called(entry_point: Callable[[], None]) -> None:
     """Call what a process calls, with what the interpreter does of an exception that nobody catches."""
     try:
         entry_point()
-    except Exception:
-        sys.excepthook(*sys.exc_info())
+    except Exception as error:
+        sys.excepthook(type(error), error, error.__traceback__)
 
 
 @pytest.fixture

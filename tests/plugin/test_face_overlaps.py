@@ -34,7 +34,7 @@ def operator_below(highest: float, face_name: str) -> torch.Tensor:
 
 
 def overlay_of(layers: torch.Tensor) -> ScreenSpaceOverlay:
-    overlay = ScreenSpaceOverlay(*layers.shape[:2])
+    overlay = ScreenSpaceOverlay(layers.shape[0], layers.shape[1])
     initialize_as(overlay, layers)
     return overlay
 

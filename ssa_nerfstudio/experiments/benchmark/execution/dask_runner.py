@@ -81,7 +81,7 @@ class DaskRunner:
                     for future in [f for f in futures if f.status in ("finished", "error", "cancelled", "lost")]:
                         ended(futures.pop(future), future.result() if future.status == "finished" else None)
                     # No more than the workers take at once: what a scheduler holds it hands out in an order of its own.
-                    while todo and len(futures) < sum(client.nthreads().values()):
+                    while todo and len(futures) < _slots(client):
                         run = todo.pop(0)
                         if (estimate(run) or 0.0) > remaining():
                             left.append(run)
@@ -145,6 +145,11 @@ class DaskRunner:
             raise InputError(problem, "start one with `dask scheduler`") from error
         with client:
             yield client
+
+
+def _slots(client: Client) -> int:
+    """Tasks that the workers do at a time."""
+    return sum(client.nthreads().values())  # pyright: ignore[reportAttributeAccessIssue] (typed as asynchronous)
 
 
 @contextmanager
