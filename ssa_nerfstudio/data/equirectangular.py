@@ -24,7 +24,7 @@ _ROWS = 256
 _MAX_STEP = 3.0
 """How many times larger than between neighboring columns the difference of the first and the last may be."""
 _MAX_POLE = 0.35
-"""How much the first and the last row may vary along the frame, of what the middle row does."""
+"""How much a pole's row may vary along the frame, of what the median row does; the edges' columns vary more."""
 _LEVELS = 2.0
 """Gray levels by which anything may differ."""
 
@@ -105,5 +105,8 @@ def _wraps_around(picture: np.ndarray) -> bool:
         return float(np.abs(small[:, one] - small[:, other]).mean())
 
     rows = small.std(axis=1).mean(axis=-1)
-    joined = step(0, -1) <= _MAX_STEP * (step(0, 1) + step(-1, -2)) / 2 + _LEVELS
+    columns = small.std(axis=0).mean(axis=-1)
+    # Edges in one color, as of a visor or a letterbox, continue each other without being neighbors.
+    plain = min(columns[0], columns[-1]) < _MAX_POLE * np.median(columns)
+    joined = not plain and step(0, -1) <= _MAX_STEP * (step(0, 1) + step(-1, -2)) / 2 + _LEVELS
     return joined and min(rows[0], rows[-1]) <= _MAX_POLE * np.median(rows) + _LEVELS

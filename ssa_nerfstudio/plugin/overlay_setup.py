@@ -263,8 +263,8 @@ def _in_words(detection: Detection, share: float, name: str, known: str = "") ->
             f"{name} have a static artifact{known and f', {known}'} ({what} of the frame): training with an overlay. "
             "(--pipeline.model.overlay off trains without.)"
         )
-    reason = "too few to tell" if detection.views < MIN_VIEWS else f"p = {detection.p_value:.2g}"
-    reason += ", too few static edges to report" if detection.too_few_edges else ""
+    reason = "too few to tell" if detection.views < MIN_VIEWS else "as many static edges as chance has"
+    reason = "some edges stand still, but too few to be one" if detection.too_few_edges else reason
     return (
         f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import json
+import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -25,6 +26,7 @@ from ssa_nerfstudio.cameras.intervals import BEGINNING
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.capture_detection import Camera, detect_camera, detections_to_json, write_detections
 from ssa_nerfstudio.evidence.detection import Detection
 from ssa_nerfstudio.evidence.verdict_in_words import verdict_in_words
@@ -129,7 +131,12 @@ def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
 def _process(plan: Plan, process: Callable[[ProgressCallback], Summary], on_progress: ProgressCallback) -> Result:
     if plan.data.exists():  # complete: a run was killed before it recorded the stage
         return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
-    summary = process(on_progress)
+    try:
+        summary = process(on_progress)
+    except InputError as error:  # its remedies are options of ssa process
+        raise InputError(
+            error.problem, re.sub(r"(?<!\S)(?<!ssa process )--(?=\w)", "--process.", error.remedy)
+        ) from error
     registered, photos = sum(each.count for each in summary.passes), sum(each.photos for each in summary.passes)
     several = len(summary.passes) > 1
     missing = [f"{each.name}: {name}" if several else name for each in summary.passes for name in each.missing]
@@ -214,7 +221,7 @@ def _export(plan: Plan, on_progress: ProgressCallback) -> Result:
                 with staged_file(plan.output / name) as part:
                     Image.fromarray(pixels).save(part, format="PNG")
             on_progress("file", 2 + 2 * (number + 1), 2 + 2 * len(layers))
-    return Result(f"{int(kept.sum()):,} Gaussians")
+    return Result(f"{int(kept.sum()):,} Gaussians", files=tuple(name for names in files for name in names))
 
 
 def _layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:

@@ -25,6 +25,8 @@ class Result:
     """What came out, in one sentence without a period."""
     warnings: tuple[str, ...] = ()
     """What the user should know, each with its remedy."""
+    files: tuple[str, ...] = ()
+    """What it has written beside `Stage.leaves`, relative to the run's folder."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class FinishedStage:
     warnings: tuple[str, ...] = ()
     decisions: tuple[str, ...] = ()
     """What it decided by itself while it worked, in sentences."""
+    files: tuple[str, ...] = ()
+    """See `Result.files`."""
 
 
 class StageDisplay(Protocol):
@@ -97,7 +101,8 @@ class RunRecord:
                 self._choices[name] = dict(entry["choices"])
                 decided = self._decisions[name] = list(entry.get("decisions", []))
                 if done := entry["done"]:
-                    known = {**done, "warnings": tuple(done["warnings"]), "decisions": tuple(decided)}
+                    sequences = {key: tuple(done.get(key, ())) for key in ("warnings", "files")}
+                    known = {**done, **sequences, "decisions": tuple(decided)}
                     self.stages[name] = FinishedStage(name, **known)
         except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             raise InputError(f"{path} cannot be read ({error})", "choose another --output") from error
@@ -124,6 +129,11 @@ class RunRecord:
         """Record what a stage is asked for."""
         self._choices[stage.name] = stage.choices
         self._write()
+
+    def left(self, stage: Stage) -> list[Path]:
+        """Files and folders that are there if the stage is done."""
+        done = self.stages.get(stage.name)
+        return [*stage.leaves, *(self._path.parent / file for file in (done.files if done else ()))]
 
     def decide(self, name: str, decision: str) -> None:
         """Record at once what a stage decided: a training that is continued does not decide again."""
@@ -174,7 +184,7 @@ def run_stages(stages: Sequence[Stage], record: RunRecord, display: StageDisplay
     """
     record.check(stages)
     for stage in stages:
-        gone = [path for path in stage.leaves if not path.exists()]
+        gone = [path for path in record.left(stage) if not path.exists()]
         earlier = stage.name in record.stages and not (gone and stage.repeatable)
         if earlier and gone:
             raise InputError(f"{gone[0]}, which the run has made, is gone", "put it back, or choose another --output")
@@ -189,8 +199,9 @@ def run_stages(stages: Sequence[Stage], record: RunRecord, display: StageDisplay
 
             with _collected_warnings(told) as logged:
                 result = stage.work(partial(display.advance, stage.name))
+            seconds = time.perf_counter() - start
             warnings = (*result.warnings, *dict.fromkeys(entry.getMessage() for entry in logged))
-            record.finish(FinishedStage(stage.name, time.perf_counter() - start, result.text, warnings))
+            record.finish(FinishedStage(stage.name, seconds, result.text, warnings, files=result.files))
         display.finish(record.stages[stage.name], earlier)
 
 

@@ -64,6 +64,15 @@ def test_a_letterboxed_photo_has_constant_poles_but_does_not_wrap(photos, tmp_pa
     assert not wraps_around(source(tmp_path / "film", framed))
 
 
+def test_photos_through_a_dark_visor_do_not_wrap(photos, tmp_path):
+    framed = [np.pad(photo[44:-44, 16:-16], ((8, 8), (16, 16), (0, 0)), constant_values=20) for photo in photos(4)]
+    framed = [photo[:, : 2 * photo.shape[0]] for photo in framed]
+    for photo in framed:
+        photo[:, -16:] = 20
+    assert framed[0].shape[1] == 2 * framed[0].shape[0]
+    assert not wraps_around(source(tmp_path / "visor", framed))
+
+
 def test_the_option_overrides_and_the_line_says_so(round_photos, photos, tmp_path):
     found = source(tmp_path / "round", round_photos)
     assert with_faces([found], "perspective")[0].faces == ()

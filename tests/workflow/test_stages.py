@@ -187,3 +187,19 @@ def test_what_a_stage_decided_is_told_at_once_and_outlives_a_stop(tmp_path):
     (done,) = RunRecord(record).stages.values()
     assert done.decisions == ("Exposure acts on the scene alone.",)
     assert done.warnings == ()
+
+
+def test_what_a_stage_wrote_and_lost_is_made_again(tmp_path):
+    """Its files are known only when it is done: how many pictures there are depends on what was learned."""
+
+    def do(on_progress) -> Result:
+        (tmp_path / "artifact.png").touch()
+        return Result("done", files=("artifact.png",))
+
+    for earlier in (False, True, False):
+        shown = Shown()
+        run_stages([Stage("export", do)], RunRecord(tmp_path / "run.json"), shown)
+        assert shown.finished == [("export", "done", (), earlier)]
+        if earlier:
+            (tmp_path / "artifact.png").unlink()
+    assert (tmp_path / "artifact.png").exists()
