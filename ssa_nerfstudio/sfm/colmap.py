@@ -18,11 +18,12 @@ import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, sa
 import pycolmap
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
-from ssa_nerfstudio.sfm.held_lens import MIN_REGISTERED, map_with_held_lens, most_registered
+from ssa_nerfstudio.sfm.held_lens import MIN_REGISTERED, better, map_with_held_lens, most_registered
 from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
 from ssa_nerfstudio.sfm.known_poses import align, triangulate
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 from ssa_nerfstudio.sfm.reconstruction import JOB, KEPT, MODEL, Mount, Pass, SfmSettings
+from ssa_nerfstudio.sfm.registration import has_real_lenses
 
 _PAIRS_PER_CALL = 64
 """Pairs that are matched and stored at once: the loss when the process is killed, and the grain of the progress bar."""
@@ -138,14 +139,14 @@ class StructureFromMotion:
         )
         model = most_registered(found)
         free = [number for number, each in enumerate(self._passes, 1) if each.mount is None]
-        if not kept and free and (model is None or model.num_reg_images() < MIN_REGISTERED * total):
+        failed = model is None or model.num_reg_images() < MIN_REGISTERED * total or not has_real_lenses(model)
+        if not kept and free and failed:
             guessed = [number for number in free if not self._is_lens_known(number)]
             other = map_with_held_lens(
                 *(self._database, self._images, models / "held", lambda: self._mapping_options(total)),
                 *(guessed, model, lambda: on_progress("poses", 0, total)),
             )
-            if other is not None and (model is None or other.num_reg_images() > model.num_reg_images()):
-                model = other
+            model = better(model, other)
         if model is not None:
             if kept:
                 align(model, {name: poses[name] for name in kept})

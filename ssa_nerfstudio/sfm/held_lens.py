@@ -1,4 +1,4 @@
-"""Mapping with the lens held at a guess first, where mapping with a free one leaves photos out.
+"""Mapping with the lens held at a guess first, where mapping with a free one leaves photos out or finds no real lens.
 
 COLMAP frees the focal lengths and the distortion from the first two photos on. Two photos of a walk straight ahead, or
 with few matches, do not determine them: the lens becomes absurd, and no third photo fits. With the lens held at a guess
@@ -12,6 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pycolmap
+
+from ssa_nerfstudio.sfm.registration import has_real_lenses
 
 MIN_REGISTERED = 0.9
 """Share of the photos below which mapping has left photos out."""
@@ -45,8 +47,8 @@ def map_with_held_lens(
         on_photo: called after every photo.
 
     Returns:
-        Of the models that have nine tenths of the photos of the largest one, that with the smallest reprojection error;
-        None where nothing is found.
+        Of the models that have nine tenths of the photos of the largest one, that with the smallest reprojection error,
+        those with real lenses first; None where nothing is found.
     """
     folder.mkdir()
     own = Path(shutil.copy(database, folder / "database.db"))
@@ -80,6 +82,20 @@ def map_with_held_lens(
         shutil.rmtree(folder)
 
 
+def better(
+    one: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction | None
+) -> pycolmap.Reconstruction | None:
+    """The model with real lenses where it has nine tenths of the other's photos, else that with most of them."""
+    models = [model for model in (one, other) if model is not None]
+    most = max((model.num_reg_images() for model in models), default=0)
+
+    def rank(model: pycolmap.Reconstruction) -> tuple[bool, int]:
+        count = model.num_reg_images()
+        return has_real_lenses(model) and count >= MIN_REGISTERED * most, count
+
+    return max(models, key=rank, default=None)
+
+
 def _guess(database: Path, numbers: Sequence[int], guess: float) -> None:
     with pycolmap.Database.open(database) as opened:
         for number in numbers:
@@ -99,4 +115,6 @@ def _best(models: Sequence[pycolmap.Reconstruction | None]) -> pycolmap.Reconstr
     mapped = [model for model in models if model is not None]
     most = max((model.num_reg_images() for model in mapped), default=0)
     complete = [model for model in mapped if model.num_reg_images() >= MIN_REGISTERED * most]
-    return min(complete, key=lambda model: model.compute_mean_reprojection_error(), default=None)
+    return min(
+        complete, key=lambda model: (not has_real_lenses(model), model.compute_mean_reprojection_error()), default=None
+    )

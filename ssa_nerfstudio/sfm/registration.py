@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -12,6 +13,12 @@ from ssa_nerfstudio.sfm.ingest import Photo
 
 if TYPE_CHECKING:
     import pycolmap
+
+_LOG = logging.getLogger(__name__)
+
+MAX_ASPECT = 1.3
+"""Ratio of the focal lengths along both axes above which a lens is taken for wrong: pixels are square, and anamorphic
+lenses, the only ones that squeeze pictures, begin at 1.33."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +89,7 @@ def check_registrations(
 
 
 def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
-    """Check that the lenses that were estimated can be undistorted, which training does first.
+    """Check that the lenses that were estimated can be undistorted, which training does first; warn of unreal ones.
 
     Args:
         names: of the passes, whose cameras are numbered from 1.
@@ -105,3 +112,21 @@ def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
                 f"(k1 = {k1:.2g}, k2 = {k2:.2g}): their poses are wrong",
                 "take photos from more directions, that overlap more",
             ) from error
+        if aspect(camera) > MAX_ASPECT:
+            _LOG.warning(
+                f"the lens that structure from motion estimates for the {names[number - 1]} photos would have pixels "
+                f"of {aspect(camera):.1f}:1 (focal lengths {fx:.0f} and {fy:.0f}): their poses are likely wrong; mask "
+                "what covers part of every frame, or take photos from more directions"
+            )
+
+
+def aspect(camera: pycolmap.Camera) -> float:
+    """Ratio of a camera's focal lengths along both axes, at least 1."""
+    lengths = sorted((camera.focal_length_x, camera.focal_length_y))
+    return lengths[1] / max(lengths[0], 1e-9)
+
+
+def has_real_lenses(model: pycolmap.Reconstruction) -> bool:
+    """Whether the cameras of all registered photos have pixels that are about square."""
+    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    return all(aspect(model.cameras[number]) <= MAX_ASPECT for number in used)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from small_captures import HEIGHT, WIDTH, poses, write
 
 from benchmarks.sfm_accuracy import center_errors
@@ -15,8 +16,9 @@ def test_the_lens_and_all_poses_are_found_from_guesses(tmp_path, photos):
     import pycolmap
 
     from ssa_nerfstudio.sfm.colmap import StructureFromMotion
-    from ssa_nerfstudio.sfm.held_lens import map_with_held_lens
+    from ssa_nerfstudio.sfm.held_lens import better, map_with_held_lens
     from ssa_nerfstudio.sfm.reconstruction import Pass, SfmSettings
+    from ssa_nerfstudio.sfm.registration import aspect, has_real_lenses
 
     images = write(tmp_path / "images", photos(VIEWS))
     passes = [Pass(sorted(path.name for path in images.iterdir()), str(images))]
@@ -44,3 +46,12 @@ def test_the_lens_and_all_poses_are_found_from_guesses(tmp_path, photos):
     assert (found.cameras[1].width, found.cameras[1].height) == (WIDTH, HEIGHT)
     assert not (tmp_path / "held").exists()
     assert (tmp_path / "database.db").read_bytes() == before
+
+    # A lens that squeezes is none, however many photos fit.
+    assert has_real_lenses(found)
+    squeezed = pycolmap.Reconstruction(found)
+    squeezed.cameras[1].params = [3 * focal, focal, *found.cameras[1].params[2:]]
+    assert aspect(squeezed.cameras[1]) == pytest.approx(3)
+    assert not has_real_lenses(squeezed)
+    assert better(squeezed, found) is better(found, squeezed) is found
+    assert better(squeezed, None) is squeezed
