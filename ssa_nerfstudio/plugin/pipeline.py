@@ -79,11 +79,12 @@ class SSAPipeline(VanillaPipeline):
         self.first_view = FirstView(lambda: self.datamanager.train_dataset.cameras)
         if test_mode == "val":
             cameras = self.datamanager.train_dataset.cameras
-            check_first_resolution(cameras, config.model.num_downscales)
             positions = cameras.camera_to_worlds[:, :3, 3]
             self.model.set_scene_extent(_extent(positions))
             self.model.start_outside_cameras(positions)
             self._examine_photos()
+            # After the photos are decoded: a size that they do not have is the dataset's fault.
+            check_first_resolution(cameras, config.model.num_downscales)
 
     def _examine_photos(self) -> None:
         """All that reads the training photos before the first step."""
