@@ -87,7 +87,7 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
     colors = _initial_colors(samples, deviation)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
     areas = [torch.from_numpy(area).to(pixel.device) for area in calm_areas(deviation[..., 0].cpu().numpy())]
-    layers = expected
+    layers = expected = _expected_behind(areas, expected, samples, colors[point], mean)
     prior = torch.ones_like(layers[..., :1])
     residual = _initial_residual(samples, colors[point], mean)
     seen_by = torch.bincount(point, minlength=samples.points)[point]
@@ -109,8 +109,6 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
         )
         # float64, because colors at a pixel may be equal within rounding, and its block then is all but singular.
         sums = _sums(pixel, (precision * moments).double(), height * width).reshape(height, width, 9)
-        if round_ == ROUNDS // 2:
-            expected = _expected_behind(areas, expected, layers, sums[..., 0], mean)
         if round_ >= ROUNDS // 2:
             prior = 1 / (PRIOR_SCALE**2 + (layers - expected).square().amax(dim=-1, keepdim=True))
         layers = _solve(sums, across, down, prior, expected, layers)
@@ -141,27 +139,42 @@ def _initial_residual(samples: PointSamples, behind: Tensor, mean: Tensor) -> Te
     return torch.where(around.reshape(-1, 1)[samples.pixel] < 0, constant, clear)
 
 
-def _expected_behind(areas: Sequence[Tensor], expected: Tensor, layers: Tensor, count: Tensor, mean: Tensor) -> Tensor:
+def _expected_behind(
+    areas: Sequence[Tensor], expected: Tensor, samples: PointSamples, behind: Tensor, mean: Tensor
+) -> Tensor:
     """T and B [h, w, 4] that the sparse prior expects: calm areas whose samples show nothing of the scene are opaque.
 
     An area is calm because the photos vary there at most MAX_OPAQUE_DEVIATION times as much as elsewhere. An artifact
-    is the reason only if its transmittance is no larger. If it is larger, what is behind is plain.
+    is the reason only if they also vary so little beside what is behind: |I - mean| is T |C - mean C|, so its ratio to
+    |I - C| is about T where T is small, and 1 where what is behind is plain. A pixel's ratio is that of its window,
+    and an area's the mean over its pixels: otherwise many points behind a button would speak for a path beside it.
 
     Args:
         areas: flat indices of the pixels of each.
         expected: elsewhere.
-        layers: T and B as estimated without that prior, [h, w, 4].
-        count: weight of the samples [h, w].
+        samples: of the scene's points.
+        behind: the color of each sample's point, [S, 3].
         mean: of the photos, [h, w, 3].
     """
-    transmittance, weight = layers[..., 0].flatten(), count.flatten()
-    behind = expected.reshape(-1, 4).clone()
+    height, width = samples.size
+    calm = samples.color.new_zeros(height * width, 1)
+    for area in areas:
+        calm[area] = 1
+    varying = (samples.color - mean.reshape(-1, 3)[samples.pixel]).abs().mean(dim=-1, keepdim=True)
+    missing = (samples.color - behind).abs().mean(dim=-1, keepdim=True)
+    # A gray level, because photos are rounded.
+    values = torch.cat([varying + _GRAY_LEVEL, missing + _GRAY_LEVEL], dim=-1) * calm[samples.pixel]
+    around = local_mean(_sums(samples.pixel, values, height * width).reshape(height, width, 2), DETAIL_RADIUS)
+    varying, missing = around.reshape(-1, 2).unbind(dim=-1)
+    ratio = (varying / missing.clamp_min(1e-12)).clamp_max(1)
+    known = missing > 1e-9
+    found = expected.reshape(-1, 4).clone()
     opaque = nn.functional.pad(mean.reshape(-1, 3), (1, 0))
     for area in areas:
-        total = weight[area].sum()
-        if total > 0 and (weight[area] * transmittance[area]).sum() <= MAX_OPAQUE_DEVIATION * total:
-            behind[area] = opaque[area].to(behind)
-    return behind.reshape(expected.shape)
+        told = ratio[area][known[area]]
+        if len(told) and told.mean() <= MAX_OPAQUE_DEVIATION:
+            found[area] = opaque[area].to(found)
+    return found.reshape(expected.shape)
 
 
 def _sums(index: Tensor, values: Tensor, count: int) -> Tensor:
