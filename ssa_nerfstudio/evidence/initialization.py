@@ -65,8 +65,9 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor) -> LayerEstim
     falloff = estimate_falloff(samples)
     photos[..., :7] /= falloff
     mean, deviation, addition, transmittance = photos.split((3, 1, 3, 1), dim=-1)
-    behind = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
-    found = estimate_layers(behind, mean, deviation, torch.cat([transmittance, addition], dim=-1))
+    if (falloff < 1).any():  # else they are sorted already
+        samples = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
+    found = estimate_layers(samples, mean, deviation, torch.cat([transmittance, addition], dim=-1))
     return replace(found, falloff=falloff)
 
 

@@ -87,9 +87,10 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
     colors = _initial_colors(samples, deviation)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
     areas = [torch.from_numpy(area).to(pixel.device) for area in calm_areas(deviation[..., 0].cpu().numpy())]
-    layers = expected = _expected_behind(areas, expected, samples, colors[point], mean)
+    clear, constant = observed - colors[point], observed - mean.reshape(-1, 3)[pixel]
+    layers = expected = _expected_behind(areas, expected, samples, clear, constant, mean)
     prior = torch.ones_like(layers[..., :1])
-    residual = _initial_residual(samples, colors[point], mean)
+    residual = _initial_residual(samples, clear, constant)
     seen_by = torch.bincount(point, minlength=samples.points)[point]
     uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
     for round_ in range(ROUNDS):
@@ -125,22 +126,21 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
     return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]))
 
 
-def _initial_residual(samples: PointSamples, behind: Tensor, mean: Tensor) -> Tensor:
-    """Differences [S, 3] from the points' colors, and where all of those disagree from the mean of the photos.
+def _initial_residual(samples: PointSamples, clear: Tensor, constant: Tensor) -> Tensor:
+    """Differences [S, 3] from the points' colors, `clear`, and where all of those disagree from the mean, `constant`.
 
     Behind what is opaque every sample is an outlier to a clear pixel. Robust weights would then silence all of them,
     and the prior would take the pixel for clear. So a pixel starts as either, by the sum of the absolute differences
     around it.
     """
     height, width = samples.size
-    clear, constant = samples.color - behind, samples.color - mean.reshape(-1, 3)[samples.pixel]
     excess = (constant.abs() - clear.abs()).sum(dim=-1, keepdim=True)
     around = local_mean(_sums(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
     return torch.where(around.reshape(-1, 1)[samples.pixel] < 0, constant, clear)
 
 
 def _expected_behind(
-    areas: Sequence[Tensor], expected: Tensor, samples: PointSamples, behind: Tensor, mean: Tensor
+    areas: Sequence[Tensor], expected: Tensor, samples: PointSamples, clear: Tensor, constant: Tensor, mean: Tensor
 ) -> Tensor:
     """T and B [h, w, 4] that the sparse prior expects: calm areas whose samples show nothing of the scene are opaque.
 
@@ -153,17 +153,17 @@ def _expected_behind(
         areas: flat indices of the pixels of each.
         expected: elsewhere.
         samples: of the scene's points.
-        behind: the color of each sample's point, [S, 3].
+        clear: the samples' differences I - C from their points' colors, [S, 3].
+        constant: and I - mean from the mean of the photos.
         mean: of the photos, [h, w, 3].
     """
     height, width = samples.size
     calm = samples.color.new_zeros(height * width, 1)
     for area in areas:
         calm[area] = 1
-    varying = (samples.color - mean.reshape(-1, 3)[samples.pixel]).abs().mean(dim=-1, keepdim=True)
-    missing = (samples.color - behind).abs().mean(dim=-1, keepdim=True)
     # A gray level, because photos are rounded.
-    values = torch.cat([varying + _GRAY_LEVEL, missing + _GRAY_LEVEL], dim=-1) * calm[samples.pixel]
+    values = torch.stack([constant, clear], dim=1).abs().mean(dim=-1) + _GRAY_LEVEL
+    values = values * calm[samples.pixel]
     around = local_mean(_sums(samples.pixel, values, height * width).reshape(height, width, 2), DETAIL_RADIUS)
     varying, missing = around.reshape(-1, 2).unbind(dim=-1)
     ratio = (varying / missing.clamp_min(1e-12)).clamp_max(1)
