@@ -107,20 +107,20 @@ def test_a_result_that_nobody_reads(tmp_path):
     assert (tmp_path / "out/splat.ply").is_file()
 
 
-def test_a_working_directory_that_was_deleted(tiny_scene, tmp_path):
-    command = 'mkdir x; cd x; rmdir ../x; exec "$0" -m ssa_nerfstudio detect --data "$1"'
+@pytest.mark.parametrize(
+    ("before", "says"),
+    [
+        ("mkdir x; cd x; rmdir ../x", "the working directory cannot be used (No such file or directory)"),
+        ("ulimit -v 1500000", "free memory"),
+    ],
+    ids=["a working directory that was deleted", "too little memory for its libraries"],
+)
+def test_what_a_command_is_started_in(before, says, tiny_scene, tmp_path):
+    command = f'{before}; exec "$0" -m ssa_nerfstudio detect --data "$1"'
     words = ["bash", "-c", command, sys.executable, tiny_scene]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2
-    assert "the working directory cannot be used (No such file or directory)" in in_one_line(done.stderr)
-
-
-def test_too_little_memory_for_its_libraries(tiny_scene, tmp_path):
-    command = 'ulimit -v 1500000; exec "$0" -m ssa_nerfstudio detect --data "$1"'
-    words = ["bash", "-c", command, sys.executable, tiny_scene]
-    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 2
-    assert "free memory" in in_one_line(done.stderr)
+    assert says in in_one_line(done.stderr)
 
 
 def without_privileges() -> list[str]:
