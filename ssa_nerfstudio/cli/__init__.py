@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from ssa_nerfstudio._system import terminal_messages
+from ssa_nerfstudio._system.environment import check_environment
 from ssa_nerfstudio.errors import InputError, SSAError
 
 COMMANDS = {
@@ -101,6 +102,7 @@ def _run(name: str, options: list[str]) -> None:
         os.getcwd()
     except OSError as error:  # as where it was deleted; libraries end the process without a reason there
         raise InputError(f"the working directory cannot be used ({error.strerror})", "change to another") from error
+    check_environment()
     if name not in COMMANDS:
         raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")
     try:

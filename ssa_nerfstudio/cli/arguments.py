@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
 import re
+import shutil
 from collections.abc import Sequence
 from contextlib import redirect_stderr
 from typing import Any, TypeVar
@@ -16,6 +18,9 @@ T = TypeVar("T")
 
 _NO_HELP = ("For full helptext", "Argument helptext", "Available subcommands")
 """Beginnings of what tyro says beside the error: nerfstudio's subcommands are readers of fifteen dataset formats."""
+
+_NARROWEST = 20
+"""Columns of a terminal for which tyro finds a layout; for fewer than 3 it searches for ever."""
 
 
 def read(command: type[T], arguments: list[str], program: str, description: str, **defaults: Any) -> T:
@@ -33,6 +38,8 @@ def read(command: type[T], arguments: list[str], program: str, description: str,
         SystemExit: of code 0, after --help.
     """
     report = io.StringIO()
+    if shutil.get_terminal_size().columns < _NARROWEST:
+        os.environ["COLUMNS"] = str(_NARROWEST)
     try:
         with redirect_stderr(report):
             return tyro.cli(command, args=arguments, prog=program, description=description, **defaults)

@@ -167,6 +167,7 @@ class Command:
             "",
             default=METHODS[self.method],
         )
+        config.check()
         config.pipeline.datamanager.data = config.data
         tests = partial(detect_with_progress, cameras, detection.threads, detection.draws)
         return choices, Plan(self.output, tests, work, choices.data(self.output), config, choices.record(), warnings)

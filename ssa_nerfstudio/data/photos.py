@@ -41,6 +41,8 @@ def open_photo(path: Path, modes: Collection[str] = ("RGB", "L", "RGBA")) -> Ite
     """
     if path.suffix.lower() in HEIF_SUFFIXES:
         _register_heif(path)
+    if path.is_fifo():
+        raise InputError(f"{path} is a pipe, no photo", "put a file there or remove it")  # opening it waits for ever
     try:
         with Image.open(path) as image:
             if image.mode not in modes:

@@ -143,6 +143,8 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
     """
     if not path.exists():
         raise InputError(f"{path} does not exist", "give a folder of photos, a folder of videos or a video")
+    if not path.is_dir() and not path.is_file():
+        raise InputError(f"{path} is neither a file nor a folder", "give a folder of photos, of videos, or a video")
     photos, videos = _media(path)
     if not photos and not videos:
         known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
@@ -181,7 +183,7 @@ _Frame = tuple[tuple[int, int], int]
 
 def _media(path: Path) -> tuple[list[Path], list[Path]]:
     """Photos and videos in a folder, or a video itself, in natural order."""
-    if not path.exists():
+    if not path.is_dir() and not path.is_file():
         return [], []
     files = [path] if path.is_file() else sorted(path.iterdir(), key=_by_name)
     files = [file for file in files if file.is_file() and not file.name.startswith(".")]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -34,15 +36,17 @@ def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
 
 
 def check_points(path: Path) -> None:
-    """Check that a PLY file holds as many colored points as it states; coordinates are not read.
+    """Check that a PLY file holds as many colored points as it states, at finite places.
 
     open3d, which nerfstudio reads it with, gives no points where the header is broken and zeros for points that are
     cut off.
 
     Raises:
-        InputError: the file is missing, no PLY, empty or truncated.
+        InputError: the file is missing, no PLY, empty or truncated, or a coordinate is no finite number.
     """
     try:
+        if path.is_fifo():
+            raise ValueError("it is a pipe")
         with path.open("rb") as file:
             head = file.read(_HEADER)
             header, end, _ = head.partition(b"end_header\n")
@@ -54,15 +58,27 @@ def check_points(path: Path) -> None:
                 raise ValueError("it holds no points")
             if missing := sorted(_NEEDED - properties.keys()):
                 raise ValueError(f"its points have no {', '.join(missing)}")
-            if kind == "ascii":
-                whole = sum(len(line.split()) >= len(properties) for line, _ in zip(file, range(count), strict=False))
-            else:
-                size = sum(np.dtype(kind).itemsize for kind in properties.values())
-                whole = (path.stat().st_size - file.tell()) // size
-            if whole < count:
-                raise ValueError(f"it holds {whole} of the {count} points that it states")
+            points = _coordinates(file, kind, count, properties)
+            if len(points) < count:
+                raise ValueError(f"it holds {len(points)} of the {count} points that it states")
+            if wrong := int((~np.isfinite(points).all(axis=1)).sum()):
+                raise ValueError(f"{wrong} of its {count} points are not finite")
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as sparse points ({error})", _REMEDY) from error
+
+
+def _coordinates(file: BinaryIO, kind: str, count: int, properties: dict[str, str]) -> np.ndarray:
+    """Read x, y, z [N, 3] of up to `count` vertices; ValueError where one is no number."""
+    if kind == "ascii":
+        places = [list(properties).index(axis) for axis in "xyz"]
+        rows = (line.split() for line, _ in zip(file, range(count), strict=False))
+        rows = [[float(row[place]) for place in places] for row in rows if len(row) >= len(properties)]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+    order = ">" if "big" in kind else "<"
+    kinds = np.dtype([(name, f"{order}{kind}") for name, kind in properties.items()])
+    whole = min(count, (os.fstat(file.fileno()).st_size - file.tell()) // kinds.itemsize)
+    table = np.frombuffer(file.read(whole * kinds.itemsize), kinds)
+    return np.stack([table[axis] for axis in "xyz"], axis=1)
 
 
 def _vertices(header: list[str]) -> tuple[str, int, dict[str, str]]:

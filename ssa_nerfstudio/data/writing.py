@@ -13,6 +13,15 @@ from pathlib import Path
 from ssa_nerfstudio.errors import InputError
 
 
+def is_text(name: str) -> bool:
+    """Whether a name of a file is UTF-8, which C++ libraries ask for; the file system takes any bytes."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 @contextmanager
 def unwritable_as_input_error(path: Path) -> Iterator[None]:
     """Turn an `OSError` of the block into an `InputError` that names the output.

@@ -6,6 +6,7 @@ import dataclasses
 import difflib
 import functools
 import json
+import math
 import re
 import reprlib
 from collections.abc import Hashable, Iterable
@@ -21,6 +22,8 @@ from ssa_nerfstudio.errors import InputError
 Kind = Literal["effects", "scenes", "benchmarks", "published"]
 """The shipped folders of configurations."""
 T = TypeVar("T")
+_MAX_VALUES = 100_000
+"""Of a file: every benchmark has a few hundred."""
 
 
 def shipped(kind: Kind) -> dict[str, Path]:
@@ -97,7 +100,14 @@ def build(cls: type[T], values: object, where: str) -> T:
 
 
 class _Loader(yaml.SafeLoader):
-    """PyYAML, stricter: a key is text and appears once; 1e-3 is a number, as in YAML 1.2."""
+    """PyYAML, stricter: a key is text and appears once; 1e-3 is a number, as in YAML 1.2; aliases stand for little."""
+
+    def get_single_node(self) -> yaml.Node | None:
+        node = super().get_single_node()
+        if node is not None and _count(node, {}) > _MAX_VALUES:
+            problem = f"with its aliases it holds more than {_MAX_VALUES} values"
+            raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark)
+        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]
@@ -106,6 +116,15 @@ class _Loader(yaml.SafeLoader):
             if problem:
                 raise yaml.constructor.ConstructorError(None, None, f"key {key!r} {problem}", node.start_mark)
         return super().construct_mapping(node, deep)
+
+
+def _count(node: yaml.Node, known: dict[yaml.Node, float]) -> float:
+    """Values that a node stands for, each alias counted as what it names; infinite where one names itself."""
+    if node not in known:
+        known[node] = math.inf
+        parts = [part for pair in node.value for part in pair] if isinstance(node, yaml.MappingNode) else node.value
+        known[node] = 1 + sum(_count(part, known) for part in parts if isinstance(part, yaml.Node))
+    return known[node]
 
 
 _Loader.add_implicit_resolver(

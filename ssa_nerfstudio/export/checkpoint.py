@@ -138,6 +138,8 @@ def data_of_run(config: Path) -> Path:
         InputError: config.yml cannot be read, or the dataset is no longer there.
     """
     try:
+        if config.is_fifo():
+            raise ValueError("it is a pipe")
         manager = yaml.load(config.read_text(encoding="utf-8"), Loader=_Inert)["pipeline"]["datamanager"]
         data = Path(*(manager["data"] or manager["dataparser"]["data"]))
     except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError) as error:

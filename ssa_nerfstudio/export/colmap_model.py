@@ -11,6 +11,7 @@ import numpy as np
 
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.cameras.lens import Lens
+from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -51,6 +52,8 @@ def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[st
     model = pycolmap.Reconstruction()
     numbers: dict[Lens, int] = {}
     for number, photo in enumerate(photos, 1):
+        if not is_text(photo.name):
+            raise InputError(f"the name of {photo.name} is no text in UTF-8", "rename the photo")
         if photo.lens not in numbers:
             numbers[photo.lens] = len(numbers) + 1
             model.add_camera_with_trivial_rig(_camera(pycolmap, numbers[photo.lens], photo.lens))

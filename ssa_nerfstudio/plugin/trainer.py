@@ -18,6 +18,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from ssa_nerfstudio._system.environment import check_environment
 from ssa_nerfstudio.errors import InputError, TrainingError, TrainingStopped
 from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, resuming
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
@@ -39,6 +40,7 @@ from ssa_nerfstudio.plugin.validation import (
     check_device,
     check_length,
     check_machine,
+    check_output,
     check_port,
     check_settings,
 )
@@ -58,9 +60,22 @@ class SSATrainerConfig(TrainerConfig):
 
     def set_timestamp(self) -> None:
         """Set the timestamp as upstream; ns-train calls this first, so what it would fail at is checked here."""
+        self.check()
+        super().set_timestamp()
+
+    def check(self) -> None:
+        """Check all that needs no photos.
+
+        Raises:
+            InputError: the machine has no such device, or a setting cannot be used.
+        """
+        check_environment()
+        check_output(self.output_dir)
         check_machine(self.machine)
         check_port(self.viewer.websocket_port)
-        super().set_timestamp()
+        check_device(self.machine.device_type)
+        check_settings(self.pipeline.model, self.machine.device_type)
+        check_length(self.max_num_iterations, self.pipeline.datamanager.camera_res_scale_factor)
 
 
 class SSATrainer(Trainer):
@@ -72,9 +87,7 @@ class SSATrainer(Trainer):
     _one: torch.Tensor | None = None
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
-        check_device(config.machine.device_type)
-        check_settings(config.pipeline.model, config.machine.device_type)  # before schedules are rounded up
-        check_length(config.max_num_iterations, config.pipeline.datamanager.camera_res_scale_factor)
+        config.check()  # before schedules are rounded up
         if config.scale_schedules:
             config = scaled(config)
         super().__init__(config, local_rank, world_size)

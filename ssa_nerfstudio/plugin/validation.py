@@ -15,6 +15,7 @@ from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
 from ssa_nerfstudio.data.training_requirements import MIN_VIEWS
+from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,6 +55,17 @@ def check_machine(machine: MachineConfig) -> None:
     for name in ("num_devices", "num_machines"):
         if (value := getattr(machine, name)) < 1:
             raise InputError(f"--machine.{name.replace('_', '-')} must be at least 1, got {value}")
+        if value > 1:
+            raise InputError(
+                f"--machine.{name.replace('_', '-')} {value}: a training uses one device",
+                "leave it at 1, and start another training with CUDA_VISIBLE_DEVICES=1",
+            )
+
+
+def check_output(folder: Path) -> None:
+    """Refuse what tensorboard and COLMAP cannot write to."""
+    if not is_text(str(folder)):
+        raise InputError(f"--output-dir {folder}: the name is no text in UTF-8", "choose another folder")
 
 
 def check_port(port: int | None) -> None:

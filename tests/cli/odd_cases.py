@@ -21,12 +21,33 @@ class Raw(str):
     """Text that is written into JSON as it is."""
 
 
+class Pipe:
+    """A named pipe in place of a file: whoever opens it waits for ever."""
+
+
+def bomb(key: str) -> str:
+    """YAML of a few lines whose aliases stand for 9^9 values."""
+    lists = [f"a{n}: &a{n} [{', '.join(9 * [f'*a{n - 1}' if n else 'x'])}]" for n in range(9)]
+    return "\n".join([*lists, f"{key}: *a8"])
+
+
+def write(path: Path, content: str | bytes | Pipe) -> None:
+    """Make a file, and the folders above it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(content, Pipe):
+        os.mkfifo(path)
+    else:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+
+
 _MADE = {
     "raw": Raw,
     "digits": lambda count: Raw("9" * int(count)),
     "nested": lambda depth: Raw("[" * int(depth) + "]" * int(depth)),
     "long": lambda length: "a" * int(length),
     "bytes": bytes.fromhex,
+    "bomb": bomb,
+    "pipe": lambda _: Pipe(),
 }
 """Values that YAML cannot state, or not briefly, by tag."""
 
@@ -109,6 +130,8 @@ def edit_photo(path: Path, case: dict[str, Any]) -> None:
         path.mkdir()
     elif "link" in case:
         path.symlink_to(case["link"])
+    elif "pipe" in case:
+        os.mkfifo(path)
     elif "content" in case:
         path.write_bytes(case["content"] if isinstance(case["content"], bytes) else case["content"].encode())
     elif "stated" in case:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from experiments.benchmark.made_results import all_results, folder_of
 from export.small_checkpoints import one_camera, write_run
-from odd_cases import corpus, edit_checkpoint, edit_json, edit_photo
+from odd_cases import corpus, edit_checkpoint, edit_json, edit_photo, write
 
 from ssa_nerfstudio._system.terminal_messages import print_error
 from ssa_nerfstudio.cli import main
@@ -118,9 +118,14 @@ def inputs(tiny_scene, tmp_path_factory) -> dict[str, str]:
     """What the calls name. Read only."""
     folder = tmp_path_factory.mktemp("inputs")
     (folder / "text.txt").write_text("text")
+    named = shutil.copytree(tiny_scene, folder / "named")
+    (named / "images/train_0003.png").rename(named / "images/\udcff.png")
+    text = (named / "transforms.json").read_text()
+    (named / "transforms.json").write_text(text.replace("train_0003.png", r"\udcff.png"))
     runs = [each for each in all_results() if each.run.scene == "attic" and each.run.seed == 0]
     return {
         "scene": str(shutil.copytree(tiny_scene, folder / "scene")),
+        "named": str(named),
         "photos": str(folder / "scene/images"),
         "run": str(folder / "run"),
         "config": str(write_run(folder / "run", one_camera(ScreenSpaceOverlay(48, 64)))),
@@ -129,6 +134,7 @@ def inputs(tiny_scene, tmp_path_factory) -> dict[str, str]:
         "long": "a" * 5000,
         "digits": "9" * 5000,
         "space": "my photos",
+        "bytes": "x\udcff",
     }
 
 
@@ -136,9 +142,10 @@ def inputs(tiny_scene, tmp_path_factory) -> dict[str, str]:
 def test_an_odd_call(case, inputs, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "here"
     for name, text in {"there.txt": "", **case.get("files", {})}.items():
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        (folder / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+        write(folder / name, text)
     monkeypatch.chdir(folder)
+    for name, value in case.get("environment", {}).items():
+        monkeypatch.setenv(name, value)
     before = contents(Path(inputs["file"]).parent)
     there = {path.name for path in folder.iterdir()}
     code = called(*(word.format(**inputs) for word in shlex.split(case["call"])))

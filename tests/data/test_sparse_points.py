@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,9 @@ RGB = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     ("content", "complaint"),
     [
         (HEADER.format(0, XYZ + RGB), "it holds no points"),
+        (HEADER.format(2, XYZ + RGB) + "a b c d e f\n1 2 3 4 5 6\n", "could not convert string to float"),
+        (HEADER.format(2, XYZ + RGB) + "1 2 nan 4 5 6\n1 2 3 4 5 6\n", "1 of its 2 points are not finite"),
+        (HEADER.format(10**30, XYZ + RGB) + "1 2 3 4 5 6\n", "it holds 1 of the 1000000000000000000000000000000"),
         (HEADER.format(1, XYZ) + "0 0 0\n", "have no blue, green, red"),
         (HEADER.format(2, XYZ + RGB) + "0 0 0 1 2 3\n", "1 of the 2 points"),
         (HEADER.format(-1, XYZ + RGB), "it holds no points"),
@@ -78,3 +82,26 @@ def test_what_is_wrong_with_points_is_said(content, complaint, tmp_path):
 def test_points_that_do_not_exist_are_named(tmp_path):
     with pytest.raises(InputError, match=r"gone.ply cannot be read as sparse points"):
         check_points(tmp_path / "gone.ply")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_points_nowhere_are_refused(value, tmp_path):
+    positions = np.zeros((3, 3))
+    positions[1, 2] = value
+    write_points(tmp_path / "points.ply", positions, np.zeros((3, 3), np.uint8))
+    with pytest.raises(InputError, match="1 of its 3 points are not finite"):
+        check_points(tmp_path / "points.ply")
+
+
+def test_a_binary_file_that_states_more_points_than_there_could_be(tmp_path):
+    write_points(tmp_path / "points.ply", np.zeros((3, 3)), np.zeros((3, 3), np.uint8))
+    content = (tmp_path / "points.ply").read_bytes()
+    (tmp_path / "points.ply").write_bytes(content.replace(b"vertex 3", b"vertex " + b"9" * 30))
+    with pytest.raises(InputError, match=r"it holds 3 of the 9{30} points"):
+        check_points(tmp_path / "points.ply")
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "points.ply")
+    with pytest.raises(InputError, match="it is a pipe"):
+        check_points(tmp_path / "points.ply")

@@ -104,6 +104,8 @@ def test_memory_that_runs_out_is_said_in_one_line(refused, run, monkeypatch):
         (("--machine.seed", "-1"), "--machine.seed must be from 0 to 4294967295, got -1"),
         (("--machine.seed", "99999999999"), "--machine.seed must be from 0"),
         (("--machine.num-devices", "0"), "--machine.num-devices must be at least 1, got 0"),
+        (("--machine.num-devices", "2"), "--machine.num-devices 2: a training uses one device; leave it at 1"),
+        (("--machine.num-machines", "2"), "--machine.num-machines 2: a training uses one device; leave it at 1"),
         (("--viewer.websocket-port", "99999"), "--viewer.websocket-port must be from 1 to 65535, got 99999"),
     ],
 )
@@ -148,6 +150,6 @@ def test_a_dataset_of_another_kind(refused, tiny_scene, tmp_path):
 )
 def test_settings_that_upstream_fails_at(settings, says, configure_training, tiny_scene, tmp_path):
     config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"overlay": "off", **settings})
-    config.set_timestamp()
+    config.timestamp = "now"
     with pytest.raises(InputError, match=says):
         config.setup(local_rank=0, world_size=1).setup()

@@ -89,6 +89,8 @@ def read(path: Path) -> Result:
     Raises:
         InputError: the file cannot be read, is truncated, or is something else.
     """
+    if not path.is_file():
+        raise InputError(f"{path} is no file")
     try:
         values = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_current_names)
     except (OSError, UnicodeDecodeError, RecursionError) as error:
