@@ -18,10 +18,10 @@ from ssa_nerfstudio.evidence.point_samples import PointSamples
 SIGNIFICANCE = 0.001
 """Chance that modes of equal variance have as large a radial share: below it there is a falloff."""
 MAX_SAMPLES = 20_000
-"""Of more, those of a regular subset of the points are used: a falloff has three parameters."""
+"""Of more, those of a regular subset of the points are used: a falloff has five parameters."""
 MAX_VIEWS = 128
 """Of more, a regular subset is used."""
-RADIAL_MODES = 3
+RADIAL_MODES = 5
 _GRAY_LEVEL = 1 / 255
 
 
@@ -33,8 +33,8 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
         samples: of the scene's points.
 
     Returns:
-        [h, w, 1] in (0, 1], of the working size: 1 in the clearest CLEAR_SHARE of the frame, and everywhere unless the
-        falloff is significant.
+        [h, w, 1] in (0, 1], of the working size: about 1 in the clearest CLEAR_SHARE of the frame, and 1 everywhere
+        unless the falloff is significant.
     """
     height, width = samples.size
     modes = _modes(height, width).to(samples.color.device)
@@ -50,17 +50,19 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
     if log_transmittance[height // 2 * width + width // 2] < clearest:
         # What is darkest in the middle is in front of the lens.
         return samples.color.new_ones(height, width, 1)
-    return (log_transmittance - clearest).exp().clamp(_GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+    clear = log_transmittance[log_transmittance >= clearest].mean()
+    return (log_transmittance - clear).exp().clamp(_GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
 def _modes(height: int, width: int) -> Tensor:
-    """Polynomials of the position, orthonormal over the frame [h w, 15], float64: r^2, r^4, r^6 and all others up to
-    the fourth degree."""
+    """Polynomials of the position, orthonormal over the frame [h w, 17], float64: r^2 to r^10 and all others up to the
+    fourth degree."""
     y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
     z = torch.complex(*torch.broadcast_tensors(x, y[:, None])).flatten() / max(height, width)
     squared = z.abs().square()
     turning = [z, z**2, z * squared, z**3, z**2 * squared, z**4]
-    modes = [squared, squared**2, squared**3, *(part for mode in turning for part in (mode.real, mode.imag))]
+    radial = [squared**power for power in range(1, RADIAL_MODES + 1)]
+    modes = [*radial, *(part for mode in turning for part in (mode.real, mode.imag))]
     stacked = torch.stack(modes, dim=-1)
     return torch.linalg.qr(stacked - stacked.mean(dim=0)).Q
 

@@ -92,7 +92,9 @@ def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide:
     falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)
     layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition) / falloff, reduction).clamp(0, 1)
     present = enlarged(present, overlay.height, overlay.width, reduction) > 0
-    initialize_as(overlay, falloff * torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
+    initialize_as(overlay, torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
+    if (falloff < 1).any():
+        overlay.falloff = _at_overlay_resolution(falloff, overlay).to(overlay.falloff)
 
 
 @torch.no_grad()

@@ -31,7 +31,8 @@ COLOR_LOGIT_RANGE = (-12.0, 12.0)
 class ScreenSpaceOverlay(nn.Module):
     """A learnable RGBA image shared by all views of one camera: W = sigmoid(W~), A = sigmoid(A~), one per pixel.
 
-    T = 1 - A and B = A W (paper). For an artifact that adds light, B = W independent of A.
+    T = 1 - A and B = A W (paper). For an artifact that adds light, B = W independent of A. Behind a lens with a falloff
+    F, which is not learned, T = F (1 - A) and B = F A W: the prior is about what is in front of the scene.
     """
 
     frame: Tensor
@@ -39,6 +40,8 @@ class ScreenSpaceOverlay(nn.Module):
     any photo is opened."""
     evidence: Tensor
     """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the artifact was found."""
+    falloff: Tensor
+    """F [h, w, 1] in (0, 1] of the lens (`evidence.falloff`); [1, 1, 1] of value 1 for none."""
 
     def __init__(self, height: int, width: int, resolution: int = 1, adds_light: bool = False) -> None:
         """Create an overlay with constant color and matte.
@@ -55,6 +58,7 @@ class ScreenSpaceOverlay(nn.Module):
         self.alpha_logits = nn.Parameter(torch.full((*size, 1), alpha).logit())
         self.register_buffer("frame", torch.tensor([height, width, resolution, int(adds_light)]))
         self.register_buffer("evidence", torch.ones(*size, 1))
+        self.register_buffer("falloff", torch.ones(1, 1, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
 
     @torch.no_grad()
@@ -103,9 +107,11 @@ class ScreenSpaceOverlay(nn.Module):
             I, of the render's shape; not clipped.
         """
         if self.resolution == reduction == 1 and not self.adds_light:
-            return composite_logits(clean, self.color_logits, self.alpha_logits, behind)
-        layers = self.layers(reduction)
-        return composite(clean, *layers) if behind is None else composite_over_splats(clean, *behind, *layers)
+            image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
+        else:
+            layers = self._before_falloff(reduction)
+            image = composite(clean, *layers) if behind is None else composite_over_splats(clean, *behind, *layers)
+        return image if self.falloff.numel() == 1 else image * self._at_training_scale(self.falloff, reduction)
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """Resample the overlay to training images, averaged premultiplied.
@@ -116,15 +122,26 @@ class ScreenSpaceOverlay(nn.Module):
         Returns:
             Transmittance T [H // reduction, W // reduction, 1] and addition B [H // reduction, W // reduction, 3].
         """
+        transmittance, addition = self._before_falloff(reduction)
+        if self.falloff.numel() == 1:
+            return transmittance, addition
+        falloff = self._at_training_scale(self.falloff, reduction)
+        return falloff * transmittance, falloff * addition
+
+    def _before_falloff(self, reduction: int) -> tuple[Tensor, Tensor]:
         if self.adds_light:
             transmittance, addition = 1.0 - self.matte(), self.color()
         else:
             transmittance, addition = premultiply(self.color(), self.matte())
         if self.resolution == reduction == 1:
             return transmittance, addition
-        pair = torch.cat([transmittance, addition], dim=-1)
-        pair = to_training_scale(pair, self.resolution, reduction, self.height, self.width)
+        pair = self._at_training_scale(torch.cat([transmittance, addition], dim=-1), reduction)
         return pair[..., :1], pair[..., 1:]
+
+    def _at_training_scale(self, layer: Tensor, reduction: int) -> Tensor:
+        if self.resolution == reduction == 1:
+            return layer
+        return to_training_scale(layer, self.resolution, reduction, self.height, self.width)
 
 
 class OracleOverlay(nn.Module):

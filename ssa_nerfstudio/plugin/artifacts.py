@@ -185,6 +185,8 @@ class Artifacts(nn.Module):
             if len(state[f"{overlay}frame"]) == 3:  # checkpoints from before additive light
                 state[f"{overlay}frame"] = F.pad(state[f"{overlay}frame"], (0, 1))
             state.pop(f"{overlay}near", None)  # checkpoints from before the estimate from points
+            if f"{overlay}alpha_logits" in state:  # checkpoints from before falloffs of their own
+                state.setdefault(f"{overlay}falloff", torch.ones(1, 1, 1))
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
         for height, width, *_ in frames:
             if not 0 < height * width <= MAX_PIXELS:
@@ -198,6 +200,7 @@ class Artifacts(nn.Module):
                     f"adds light) {frames or 'absent'}, this run's are {here or 'absent'}",
                     "resume with the photos, camera-res-scale-factor and overlay options it was trained with",
                 )
+            self._allocate_falloffs(state, prefix)
             return
         if frames and not wanted:
             raise InputError(
@@ -212,6 +215,13 @@ class Artifacts(nn.Module):
         ).to(device)
         for name in ("camera_keys", "lenses", "bare_keys"):
             setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))
+        self._allocate_falloffs(state, prefix)
+
+    def _allocate_falloffs(self, state: dict[str, Any], prefix: str) -> None:
+        for g, overlay in enumerate(self.overlays):
+            if isinstance(overlay, ScreenSpaceOverlay):
+                without = state[f"{prefix}overlays.{g}.falloff"].numel() == 1
+                overlay.falloff = overlay.falloff.new_ones((1, 1, 1) if without else overlay.evidence.shape)
 
     def resume_from(
         self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str, photos: list[str]

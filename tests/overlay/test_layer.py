@@ -145,6 +145,22 @@ def test_a_state_dict_restores_the_overlay(resolution: int, adds_light: bool) ->
             assert torch.equal(found, expected)
 
 
+@pytest.mark.parametrize("adds_light", [False, True])
+@pytest.mark.parametrize("reduction", [1, 2])
+@pytest.mark.parametrize("resolution", [1, 2])
+def test_a_falloff_darkens_scene_and_artifact_alike_and_is_no_concern_of_sparsity(
+    resolution: int, reduction: int, adds_light: bool
+) -> None:
+    overlay = randomized(12, 16, resolution, adds_light)
+    clean = random(12 // reduction, 16 // reduction, 3)
+    behind = random(12 // reduction, 16 // reduction, 1), random(3)
+    before, opacity = overlay.composite(clean, reduction, behind), overlay.opacity()
+    overlay.falloff = torch.full_like(overlay.evidence, 0.6)
+    torch.testing.assert_close(overlay.composite(clean, reduction, behind), 0.6 * before)
+    torch.testing.assert_close(composite(clean, *overlay.layers(reduction)), 0.6 * before)
+    assert torch.equal(overlay.opacity(), opacity)
+
+
 def test_a_state_dict_of_another_frame_is_refused() -> None:
     with pytest.raises(RuntimeError, match="size mismatch"):
         ScreenSpaceOverlay(9, 13).load_state_dict(ScreenSpaceOverlay(13, 9).state_dict())
@@ -264,4 +280,4 @@ def test_a_camera_of_many_pixels_says_its_size(adds_light: bool) -> None:
     overlay = ScreenSpaceOverlay(5, 7, 2, adds_light)
     assert overlay.frame.tolist() == [5, 7, 2, int(adds_light)]
     assert overlay.frame.dtype == torch.int64
-    assert set(overlay.state_dict()) == {"color_logits", "alpha_logits", "frame", "evidence"}
+    assert set(overlay.state_dict()) == {"color_logits", "alpha_logits", "frame", "evidence", "falloff"}
