@@ -72,7 +72,8 @@ class Command:
         """Check the options and find the photos.
 
         Returns:
-            The cameras to train on, and the work: `photos_to_dataset.process`, which only lacks `on_progress`.
+            The cameras to train on, and the work: `photos_to_dataset.process`, which only lacks `found` and
+            `on_progress`.
 
         Raises:
             InputError: an option or a file cannot be used.
@@ -154,7 +155,9 @@ class Command:
             camera = f"{each.name}: " if len(summary.passes) > 1 else ""
             left_out = f"; not: {name_list(each.missing)}" if each.missing else ""
             console.print(f"{camera}{each.count} of {each.photos} photos registered{left_out}")
-        if self.detect and not summary.masked:
+        if summary.unmasked:
+            console.print("more photos registered without a mask of the detected artifact: nothing was masked")
+        elif self.detect and not summary.masked:
             console.print("no opaque artifact was detected: nothing was masked")
         if summary.masked:
             console.print(f"{summary.masked:.0%} of the frame was masked")

@@ -151,7 +151,7 @@ class Command:
             sizes = [frames.intrinsics(frame) for frame in frames.frames]
             longest = max(max(size.width, size.height) for size in sizes)
         else:
-            words = ["--train", str(self.photos), "--output", str(self.output / DATASET), *processing]
+            words = ["--train", str(self.photos), "--output", str(self.output / DATASET), "--detect", *processing]
             sources, work = arguments.read(process.Command, words, "ssa process", "").prepared()
             longest = max(source.longest_side for source in sources)
             for source in sources:

@@ -18,12 +18,12 @@ import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, sa
 import pycolmap
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
-from ssa_nerfstudio.sfm.held_lens import MIN_REGISTERED, better, map_with_held_lens, most_registered
+from ssa_nerfstudio.sfm.held_lens import map_with_held_lens, most_registered
 from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
 from ssa_nerfstudio.sfm.known_poses import align, triangulate
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 from ssa_nerfstudio.sfm.reconstruction import JOB, KEPT, MODEL, Mount, Pass, SfmSettings
-from ssa_nerfstudio.sfm.registration import has_real_lenses
+from ssa_nerfstudio.sfm.registration import better, is_complete
 
 _PAIRS_PER_CALL = 64
 """Pairs that are matched and stored at once: the loss when the process is killed, and the grain of the progress bar."""
@@ -139,8 +139,7 @@ class StructureFromMotion:
         )
         model = most_registered(found)
         free = [number for number, each in enumerate(self._passes, 1) if each.mount is None]
-        failed = model is None or model.num_reg_images() < MIN_REGISTERED * total or not has_real_lenses(model)
-        if not kept and free and failed:
+        if not kept and free and not is_complete(model, total):
             guessed = [number for number in free if not self._is_lens_known(number)]
             other = map_with_held_lens(
                 *(self._database, self._images, models / "held", lambda: self._mapping_options(total)),

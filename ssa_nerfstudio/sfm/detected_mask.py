@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import cv2
 import numpy as np
@@ -16,11 +17,36 @@ from ssa_nerfstudio.errors import InputError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ssa_nerfstudio.evidence.detection import Detection
     from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 _SIZE = 960
 """Longest side to which photos are reduced for detection, pixels: twice its working resolution."""
+
+
+@dataclass(frozen=True)
+class FoundArtifact:
+    """What a detection found in the photos of one camera, as far as structure from motion makes use of it."""
+
+    verdict: Literal["none", "faint", "opaque"]
+    """As of `evidence.detection.Detection`."""
+    mask: np.ndarray
+    """bool [H, W] of the upright photos, or smaller: True where the artifact is."""
+    stretches: tuple[slice, ...]
+    """Of photos in the order of the capture, those with an artifact that does not change in them."""
+    photos: int
+    """How many were tested."""
+
+    @classmethod
+    def of(
+        cls,
+        verdict: Literal["none", "faint", "opaque"],
+        mask: np.ndarray,
+        photos: int,
+        intervals: Sequence[tuple[int, int, str]] = (),
+    ) -> FoundArtifact:
+        """From what detection says of the photos, and of each interval: its first photo, the one after, its verdict."""
+        stretches = [(first, end) for first, end, own in intervals or [(0, photos, verdict)] if own != "none"]
+        return cls(verdict, mask, tuple(slice(*each) for each in stretches), photos)
 
 
 class CameraEvidence:
@@ -29,15 +55,19 @@ class CameraEvidence:
     They are read when something is first asked; once for all questions, and again where the artifact changes.
     """
 
-    def __init__(self, photos: Sequence[Path], advance: Callable[[int], None]) -> None:
+    def __init__(
+        self, photos: Sequence[Path], advance: Callable[[int], None], found: FoundArtifact | None = None
+    ) -> None:
         """Store the arguments.
 
         Args:
             photos: files of one size, at least one, in the order of the capture.
             advance: called with the number of photos read so far.
+            found: in these photos by an earlier detection, which is then not repeated; what it found in another number
+                of photos, such as other frames of a video, is not used.
         """
         self._files, self._advance = photos, advance
-        self._size = 0, 0
+        self._given = found if found is not None and found.photos == len(photos) else None
 
     def opaque_mask(self) -> np.ndarray | None:
         """Mask an opaque artifact.
@@ -50,24 +80,21 @@ class CameraEvidence:
         Raises:
             InputError: a photo cannot be decoded.
         """
-        if self._detection.verdict != "opaque":
+        if self._found.verdict != "opaque":
             return None
-        used = (~self._detection.mask).numpy().astype(np.uint8)
-        return cv2.resize(used, self._size, interpolation=cv2.INTER_NEAREST) > 0
+        height, width = read_photo(self._files[0]).shape[:2]
+        used = (~self._found.mask).astype(np.uint8)
+        return cv2.resize(used, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
     def unchanged_stretches(self) -> list[slice]:
         """Stretches of photos with an artifact, opaque or not, that does not change in them; empty where there is none.
 
         Photos that cannot be tested, such as transparent ones, may all show one.
         """
-        everything = slice(0, len(self._files))
         try:
-            found = self._detection
+            return [*self._found.stretches]
         except InputError:
-            return [everything]
-        if not found.intervals:
-            return [] if found.verdict == "none" else [everything]
-        return [slice(each.first, each.end) for each in found.intervals if each.verdict != "none"]
+            return [slice(0, len(self._files))]
 
     def check_mask_polarity(self, mask: np.ndarray) -> None:
         """Check that a mask does not keep the artifact that is detected, instead of leaving it out.
@@ -85,10 +112,14 @@ class CameraEvidence:
         check_polarity(reduced, self._statistics, "--mask", "invert it with --invert-mask: black is ignored")
 
     @cached_property
-    def _detection(self) -> Detection:
+    def _found(self) -> FoundArtifact:
+        if self._given is not None:
+            return self._given
         from ssa_nerfstudio.evidence.interval_detection import detect_in_intervals
 
-        return detect_in_intervals(self._photos, whole=self._statistics)
+        detection = detect_in_intervals(self._photos, whole=self._statistics)
+        intervals = [(each.first, each.end, each.verdict) for each in detection.intervals]
+        return FoundArtifact.of(detection.verdict, detection.mask.numpy(), len(self._files), intervals)
 
     @cached_property
     def _statistics(self) -> ImageStatistics:
@@ -102,9 +133,9 @@ class CameraEvidence:
 
         for number, path in enumerate(self._files, 1):
             photo = read_photo(path)
-            self._size = photo.shape[1], photo.shape[0]
-            if (scale := _SIZE / max(self._size)) < 1:
-                reduced = max(1, round(self._size[0] * scale)), max(1, round(self._size[1] * scale))
+            height, width = photo.shape[:2]
+            if (scale := _SIZE / max(width, height)) < 1:
+                reduced = max(1, round(width * scale)), max(1, round(height * scale))
                 photo = cv2.resize(photo, reduced, interpolation=cv2.INTER_AREA)
             yield torch.from_numpy(photo)
             self._advance(number)

@@ -13,10 +13,8 @@ from pathlib import Path
 
 import pycolmap
 
-from ssa_nerfstudio.sfm.registration import has_real_lenses
+from ssa_nerfstudio.sfm.registration import MIN_REGISTERED, has_real_lenses
 
-MIN_REGISTERED = 0.9
-"""Share of the photos below which mapping has left photos out."""
 _GUESSES = (1.2, 0.85, 0.6, 0.42)
 """Focal lengths to hold, in longer sides of the photo: 45 degrees, which is COLMAP's guess, to 100, by roots of 2."""
 
@@ -80,20 +78,6 @@ def map_with_held_lens(
         return best
     finally:
         shutil.rmtree(folder)
-
-
-def better(
-    one: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction | None
-) -> pycolmap.Reconstruction | None:
-    """The model with real lenses where it has nine tenths of the other's photos, else that with most of them."""
-    models = [model for model in (one, other) if model is not None]
-    most = max((model.num_reg_images() for model in models), default=0)
-
-    def rank(model: pycolmap.Reconstruction) -> tuple[bool, int]:
-        count = model.num_reg_images()
-        return has_real_lenses(model) and count >= MIN_REGISTERED * most, count
-
-    return max(models, key=rank, default=None)
 
 
 def _guess(database: Path, numbers: Sequence[int], guess: float) -> None:

@@ -9,27 +9,32 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import PIL.Image
 
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.panorama import cut
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.sfm.detected_mask import CameraEvidence
+from ssa_nerfstudio.sfm.detected_mask import FoundArtifact
 from ssa_nerfstudio.sfm.existing_model import ExistingModel
 from ssa_nerfstudio.sfm.feature_mask import widened
-from ssa_nerfstudio.sfm.fisheye_guess import fisheye_guess
-from ssa_nerfstudio.sfm.flat_field import MIN_PHOTOS, write_flattened
+from ssa_nerfstudio.sfm.feature_passes import camera_evidence, feature_passes
 from ssa_nerfstudio.sfm.ingest import Photo, expected_count, ingest
 from ssa_nerfstudio.sfm.model_repair import Repair
-from ssa_nerfstudio.sfm.nerfstudio_dataset import MASK, write_dataset
+from ssa_nerfstudio.sfm.nerfstudio_dataset import write_dataset
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
-from ssa_nerfstudio.sfm.reconstruction import KEPT, Mount, Pass, SfmSettings, reconstruct
-from ssa_nerfstudio.sfm.registration import PassRegistration, check_lenses, check_registrations, registrations
+from ssa_nerfstudio.sfm.reconstruction import KEPT, Pass, SfmSettings, reconstruct
+from ssa_nerfstudio.sfm.registration import (
+    PassRegistration,
+    better,
+    check_lenses,
+    check_registrations,
+    is_complete,
+    registrations,
+)
 from ssa_nerfstudio.sfm.work_folder import resumable_work
 
 if TYPE_CHECKING:
@@ -52,6 +57,17 @@ class Summary:
     """Share of the training photos' frames that is masked, mean over the cameras, in [0, 1]."""
     repair: Repair | None = None
     """What became of the model that there was."""
+    unmasked: bool = False
+    """Whether an artifact that was detected is not masked after all, because the photos fit better with its area."""
+
+
+class _Mapped(NamedTuple):
+    """What structure from motion makes of the photos with some masks."""
+
+    folder: Path
+    passes: list[Pass]
+    masks: Sequence[np.ndarray | None]
+    model: pycolmap.Reconstruction | None
 
 
 def process(
@@ -64,6 +80,7 @@ def process(
     min_registered: float = 0.5,
     settings: SfmSettings | None = None,
     known: ExistingModel | None = None,
+    found: Sequence[FoundArtifact] | None = None,
     on_progress: ProgressCallback = lambda part, done, total: None,
 ) -> Summary:
     """Write a nerfstudio dataset: images/, transforms.json, sparse_pc.ply and COLMAP's model in colmap/sparse/0.
@@ -76,12 +93,15 @@ def process(
         sources: the cameras to train on.
         output: folder to make.
         mask: bool [height, width] for the only source, True where features may lie; of equirectangular photos, whole.
-        detect: whether to detect an opaque artifact of each camera and mask it, where no mask is given.
+        detect: whether to detect an opaque artifact of each camera and mask it, where no mask is given. Where too few
+            photos register then, poses are found without masks, too.
         clean: a pass of the same scene without the artifact, to test on.
         frames: number of frames to take from videos of a camera, at least 1.
         min_registered: required share of registered photos of each pass, in [0, 1].
         settings: settings of structure from motion.
         known: a model of the photos of `sources`, which are its own; the photos are registered to what holds of it.
+        found: what was detected in the photos of each source, which is then not repeated; of no use where `known` has
+            sources of its own. Faces of equirectangular photos are tested one by one in any case.
         on_progress: called with how far each part is.
 
     Raises:
@@ -100,26 +120,38 @@ def process(
         inputs = [(*(camera.name for camera in source.cameras), source.fingerprint(), frames) for source in sources]
         dataset = work.subfolder("dataset", inputs)
         photos = _ingest_all(sources, dataset, frames, on_progress)
-        evidence = [_evidence(dataset, each, on_progress) for each in photos[:train]]
+        known_of = [] if found is None or known is not None else found
+        evidence = camera_evidence(dataset, sources, photos[:train], known_of, on_progress)
         if mask is not None:
             for used, each in zip(masks, evidence, strict=True):
                 assert used is not None
                 each.check_mask_polarity(used)
         elif detect:
-            masks = [None if (found := each.opaque_mask()) is None else widened(found) for each in evidence]
+            masks = [None if (used := each.opaque_mask()) is None else widened(used) for each in evidence]
         poses = {} if known is None else _poses(known, photos)
         start = [known and known.lenses, *((name, pose.tolist()) for name, pose in poses.items())]
-        asked = [inputs, [*map(_digest, masks)], asdict(settings) | {"threads": None}, start]
-        motion = work.subfolder("motion", asked)
-        passes = _passes(sources, photos, dataset / "images", motion, masks, evidence, settings, on_progress)
-        if known is not None:
-            passes[:train] = [replace(each, lens=lens) for each, lens in zip(passes, known.lenses, strict=False)]
-        found = reconstruct(dataset / "images", passes, motion, settings, on_progress, poses)
-        model = found and _load(found)
+
+        def mapped(masks: Sequence[np.ndarray | None], folder: str) -> _Mapped:
+            asked = [inputs, [*map(_digest, masks)], asdict(settings) | {"threads": None}, start]
+            motion = work.subfolder(folder, asked)
+            passes = feature_passes(sources, photos, dataset / "images", motion, masks, evidence, settings, on_progress)
+            if known is not None:
+                passes[:train] = [replace(each, lens=lens) for each, lens in zip(passes, known.lenses, strict=False)]
+            model = reconstruct(dataset / "images", passes, motion, settings, on_progress, poses)
+            return _Mapped(motion, passes, masks, model and _load(model))
+
+        outcome, unmasked = mapped(masks, "motion"), False
+        detected = mask is None and any(each is not None for each in masks)
+        if detected and known is None and not is_complete(outcome.model, sum(map(len, photos))):
+            # Masks that hide most of the scene do more harm than features on the artifact.
+            without = mapped([None] * train, "motion_without_masks")
+            unmasked = better(outcome.model, without.model) is not outcome.model
+            outcome = without if unmasked else outcome
+        motion, passes, masks, model = outcome
         registered = registrations(names, photos, model)
         try:
-            detected = "detection" if any(each is not None for each in masks) else None
-            check_registrations(registered, min_registered, "user" if mask is not None else detected)
+            masked_by = "user" if mask is not None else "detection" if detected else None
+            check_registrations(registered, min_registered, masked_by)
         except InputError as error:
             work.keep_after_error = True
             remedy = (
@@ -141,7 +173,8 @@ def process(
         dataset.rename(output)
         work.remove()
     masked = float(np.mean([0.0 if mask is None else 1 - mask.mean() for mask in masks]))
-    return Summary(registered, model.num_points3D(), model.compute_mean_reprojection_error(), masked, repair)
+    error = model.compute_mean_reprojection_error()
+    return Summary(registered, model.num_points3D(), error, masked, repair, unmasked)
 
 
 def _poses(known: ExistingModel, photos: Sequence[Sequence[Photo]]) -> dict[str, np.ndarray]:
@@ -178,67 +211,6 @@ def _ingest_all(
     photos = [camera for source in sources for camera in ingest(source, dataset, frames, advance)]
     on_progress("photos", total, total)
     return photos
-
-
-def _evidence(dataset: Path, photos: Sequence[Photo], on_progress: ProgressCallback) -> CameraEvidence:
-    files = [dataset / "images" / photo.name for photo in photos]
-    return CameraEvidence(files, lambda done: on_progress("detection", done, len(files)))
-
-
-def _passes(
-    sources: Sequence[Source],
-    photos: Sequence[Sequence[Photo]],
-    images: Path,
-    folder: Path,
-    masks: Sequence[np.ndarray | None],
-    evidence: Sequence[CameraEvidence],
-    settings: SfmSettings,
-    on_progress: ProgressCallback,
-) -> list[Pass]:
-    """Where features of each pass are extracted: those that train have flattened copies, and masks where there are."""
-    passes = []
-    cameras = [(source, camera) for source in sources for camera in source.cameras]
-    for number, ((source, camera), each) in enumerate(zip(cameras, photos, strict=True)):
-        names = [photo.name for photo in each]
-        mount, lens = None, None
-        if (face := camera.face) is not None:
-            mount = Mount(source.name, f"{camera.name}_", face.from_panorama.tolist())
-            lens = [face.focal, face.focal, face.size / 2, face.size / 2, 0.0, 0.0, 0.0, 0.0]
-        elif settings.camera_model == "OPENCV_FISHEYE":
-            lens = fisheye_guess([images / name for name in names])
-        if number >= len(masks):
-            passes.append(Pass(names, str(images), None, lens, mount))
-            continue
-        copies = _flatten(names, images, folder / "flat", evidence[number], settings, on_progress)
-        file = None
-        if (mask := masks[number]) is not None:
-            file = str(folder / (MASK if len(masks) == 1 else f"{Path(MASK).stem}_{camera.name}.png"))
-            PIL.Image.fromarray(mask).save(file)
-        passes.append(Pass(names, str(copies), file, lens, mount))
-    return passes
-
-
-def _flatten(
-    names: list[str],
-    images: Path,
-    folder: Path,
-    evidence: CameraEvidence,
-    settings: SfmSettings,
-    on_progress: ProgressCallback,
-) -> Path:
-    """Folder of the photos without their static factor; `images` where they have none or settings disable it."""
-    if not settings.flatten or len(names) < MIN_PHOTOS:
-        return images
-    if not (folder.is_dir() and all((folder / name).is_file() for name in names)):
-        on_progress("artifact", 0, len(names))
-        files = [images / name for name in names]
-        # A walk straight ahead has static edges of its own, which belong to the scene.
-        stretches = evidence.unchanged_stretches()
-        size = settings.max_image_size
-        if not write_flattened(files, stretches, folder, size, lambda done: on_progress("artifact", done, len(names))):
-            on_progress("artifact", len(names), len(names))
-            return images
-    return folder
 
 
 def _load(model: Path) -> pycolmap.Reconstruction:

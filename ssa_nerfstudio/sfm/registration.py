@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
+MIN_REGISTERED = 0.9
+"""Share of the photos below which mapping has left photos out."""
 MAX_ASPECT = 1.3
 """Ratio of the focal lengths along both axes above which a lens is taken for wrong: pixels are square, and anamorphic
 lenses, the only ones that squeeze pictures, begin at 1.33."""
@@ -130,3 +132,22 @@ def has_real_lenses(model: pycolmap.Reconstruction) -> bool:
     """Whether the cameras of all registered photos have pixels that are about square."""
     used = {image.camera_id for image in model.images.values() if image.has_pose}
     return all(aspect(model.cameras[number]) <= MAX_ASPECT for number in used)
+
+
+def is_complete(model: pycolmap.Reconstruction | None, photos: int) -> bool:
+    """Whether mapping has left out few of so many photos, and found lenses that cameras can have."""
+    return model is not None and model.num_reg_images() >= MIN_REGISTERED * photos and has_real_lenses(model)
+
+
+def better(
+    one: pycolmap.Reconstruction | None, other: pycolmap.Reconstruction | None
+) -> pycolmap.Reconstruction | None:
+    """The model with real lenses where it has nine tenths of the other's photos, else that with most of them."""
+    models = [model for model in (one, other) if model is not None]
+    most = max((model.num_reg_images() for model in models), default=0)
+
+    def rank(model: pycolmap.Reconstruction) -> tuple[bool, int]:
+        count = model.num_reg_images()
+        return has_real_lenses(model) and count >= MIN_REGISTERED * most, count
+
+    return max(models, key=rank, default=None)

@@ -79,7 +79,7 @@ class Choices:
         stages = {
             "Look at the splats": ["ns-viewer", *run],
             "Detect": ["ssa", "detect", "--data", photos, "--output", "again/detection", *self.detect],
-            "Poses": ["ssa", "process", "--train", photos, "--output", "again/dataset", *self.process],
+            "Poses": ["ssa", "process", "--train", photos, "--output", "again/dataset", "--detect", *self.process],
             "Train": ["ns-train", self.method, "--data", data, "--output-dir", "again", *self._training()],
             "Evaluate": ["ns-eval", *run, "--output-path", "again/evaluation.json"],
             "Splats": ["ssa", "export-splats", *run, "--output-dir", "again", "--compressed"],

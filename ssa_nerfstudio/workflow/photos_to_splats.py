@@ -27,7 +27,7 @@ from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.capture_detection import Camera, detect_camera, detections_to_json, write_detections
+from ssa_nerfstudio.evidence.capture_detection import Camera, detect_camera
 from ssa_nerfstudio.evidence.detection import Detection
 from ssa_nerfstudio.evidence.verdict_in_words import verdict_in_words
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers, undistorted_layers
@@ -37,16 +37,16 @@ from ssa_nerfstudio.export.panorama_artifact import face_changes, panorama_layer
 from ssa_nerfstudio.export.splats import select, write_compressed_ply, write_ply
 from ssa_nerfstudio.overlay.rgba import to_rgba8
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
+from ssa_nerfstudio.sfm.detected_mask import FoundArtifact
 from ssa_nerfstudio.sfm.photos_to_dataset import Summary
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+from ssa_nerfstudio.workflow.detection_folder import VERDICTS, found_artifacts, write_found
 from ssa_nerfstudio.workflow.finished_training import evaluate, write_view_pictures
 from ssa_nerfstudio.workflow.resumable_training import config_file, load_trained, train
 from ssa_nerfstudio.workflow.stages import Result, Stage
 
 DETECTION, DATASET, TRAINING, EVALUATION = "detection", "dataset", "training", "evaluation"
 """Folders of a run, one for each of the first four stages."""
-VERDICTS = "detection.json"
-"""File in the first of them."""
 RECORD = "run.json"
 """File of the finished stages."""
 _MIN_MATTE, _MIN_COVERED = 0.3, 0.001
@@ -61,8 +61,8 @@ class Plan:
     output: Path
     detect: Callable[[ProgressCallback], dict[str, Detection]]
     """Tests the photos of each camera for an artifact."""
-    process: Callable[[ProgressCallback], Summary] | None
-    """Makes the dataset; None where the photos have poses already."""
+    process: Callable[[Sequence[FoundArtifact], ProgressCallback], Summary] | None
+    """Makes the dataset, given what was found in the photos of each camera; None where they have poses already."""
     data: Path
     """The dataset, existing or to be made."""
     training: SSATrainerConfig
@@ -118,8 +118,7 @@ def artifact_files(overlays: Sequence[str]) -> list[tuple[str, str]]:
 def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
     found = plan.detect(on_progress)
     with _emptied(plan.output / DETECTION) as staged:
-        write_detections(staged, found)
-        (staged / VERDICTS).write_text(detections_to_json(found), encoding="utf-8")
+        write_found(staged, found)
     sentences = [f"{name}: {verdict_in_words(detection)}" for name, detection in found.items()]
     bare = [detection for detection in found.values() if detection.verdict == "none"]
     missed = "a soft artifact has no edges; training looks again, with the scene's points, and says what it found"
@@ -128,11 +127,13 @@ def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
     )
 
 
-def _process(plan: Plan, process: Callable[[ProgressCallback], Summary], on_progress: ProgressCallback) -> Result:
+def _process(
+    plan: Plan, process: Callable[[Sequence[FoundArtifact], ProgressCallback], Summary], on_progress: ProgressCallback
+) -> Result:
     if plan.data.exists():  # complete: a run was killed before it recorded the stage
         return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
     try:
-        summary = process(on_progress)
+        summary = process(found_artifacts(plan.output / DETECTION), on_progress)
     except InputError as error:  # its remedies are options of ssa process
         raise InputError(
             error.problem, re.sub(r"(?<!\S)(?<!ssa process )--(?=\w)", "--process.", error.remedy)
@@ -143,9 +144,11 @@ def _process(plan: Plan, process: Callable[[ProgressCallback], Summary], on_prog
     warning = f"no pose was found for {name_list(missing)}; where parts of the "
     warning += "scene are missing, add photos between them and their neighbors"
     repaired = "" if summary.repair is None else f"; of the model, {summary.repair.in_words()}"
+    masked = f"; {summary.masked:.0%} of the frame, the artifact and a rim, was masked" if summary.masked else ""
+    masked = "; more photos have poses without a mask of the artifact" if summary.unmasked else masked
     return Result(
         f"{registered} of {photos} photos have poses, {summary.points:,} points, mean reprojection error "
-        f"{summary.reprojection_error:.2f} pixels{repaired}",
+        f"{summary.reprojection_error:.2f} pixels{masked}{repaired}",
         (warning,) if missing else (),
     )
 

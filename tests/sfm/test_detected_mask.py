@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_captures import HEIGHT, WIDTH, write
 
-from ssa_nerfstudio.sfm.detected_mask import CameraEvidence
+from ssa_nerfstudio.sfm.detected_mask import CameraEvidence, FoundArtifact
 
 VIEWS = 24
 
@@ -31,3 +31,25 @@ def test_photos_that_cannot_be_tested_may_show_an_artifact(tmp_path, photos):
     folder = write(tmp_path / "photos", transparent)
     evidence = CameraEvidence(sorted(folder.iterdir()), lambda _: None)
     assert evidence.unchanged_stretches() == [slice(0, 8)]
+
+
+def test_what_an_earlier_detection_found_is_taken_without_reading_all_photos(tmp_path, photos):
+    files = sorted(write(tmp_path / "photos", photos(8)).iterdir())
+    hidden = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    hidden[:30] = True
+    found = FoundArtifact.of("opaque", hidden, 8, [(0, 3, "none"), (3, 8, "opaque")])
+    read: list[int] = []
+    evidence = CameraEvidence(files, read.append, found)
+    assert evidence.unchanged_stretches() == [slice(3, 8)]
+    used = evidence.opaque_mask()
+    assert used is not None
+    assert np.array_equal(used, ~hidden)
+    assert read == []
+
+
+def test_what_was_found_in_other_photos_is_not_used(tmp_path, photos):
+    """Frames of a video, of which structure from motion takes another number."""
+    files = sorted(write(tmp_path / "photos", photos(8)).iterdir())
+    found = FoundArtifact.of("opaque", np.ones((HEIGHT, WIDTH), dtype=bool), 20)
+    evidence = CameraEvidence(files, lambda _: None, found)
+    assert evidence.opaque_mask() is None

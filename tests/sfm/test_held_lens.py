@@ -16,9 +16,9 @@ def test_the_lens_and_all_poses_are_found_from_guesses(tmp_path, photos):
     import pycolmap
 
     from ssa_nerfstudio.sfm.colmap import StructureFromMotion
-    from ssa_nerfstudio.sfm.held_lens import better, map_with_held_lens
+    from ssa_nerfstudio.sfm.held_lens import map_with_held_lens
     from ssa_nerfstudio.sfm.reconstruction import Pass, SfmSettings
-    from ssa_nerfstudio.sfm.registration import aspect, has_real_lenses
+    from ssa_nerfstudio.sfm.registration import aspect, better, has_real_lenses
 
     images = write(tmp_path / "images", photos(VIEWS))
     passes = [Pass(sorted(path.name for path in images.iterdir()), str(images))]

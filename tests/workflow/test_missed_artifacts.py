@@ -11,7 +11,8 @@ import pytest
 
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
-from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, VERDICTS, missed_artifacts
+from ssa_nerfstudio.workflow.detection_folder import VERDICTS
+from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, missed_artifacts
 
 
 def layers(name: str, covered: int) -> ArtifactLayers:

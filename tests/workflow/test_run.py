@@ -69,6 +69,14 @@ def test_it_continues_where_it_was_killed(finished):
     assert stages["process"].startswith(f"{VIEWS} of {VIEWS} photos have poses")
 
 
+def test_structure_from_motion_masks_what_the_first_stage_found(finished):
+    assert re.search(r"; \d+% of the frame, the artifact and a rim, was masked", results(finished)["process"])
+    used = np.asarray(Image.open(finished / "dataset/mask_colmap.png"))
+    found = np.asarray(Image.open(finished / "detection/mask_colmap.png"))
+    assert not used[found == 0].any()
+    assert used[found > 0].mean() > 0.9
+
+
 def test_what_training_decided_before_it_was_killed_is_on_the_screen_and_the_page(finished):
     verdict = r"The photos have a static artifact \([^)]* of the frame\): training with an overlay"
     assert re.search(verdict, " ".join((finished.parent / "screen.txt").read_text().split()))
@@ -132,6 +140,7 @@ def test_the_commands_on_the_page_work_in_its_folder(finished):
     done = subprocess.run(shell, shell=True, cwd=finished, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert (finished / "again/detection/evidence.png").is_file()
+    assert any(command.endswith("again/dataset --detect --threads 1") for command in commands)
     (train,) = [command for command in commands if command.startswith("ns-train")]
     assert train == "ns-train ssa-splatfacto --data dataset --output-dir again --max-num-iterations 120"
 
