@@ -135,10 +135,12 @@ class Command:
         from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
         from ssa_nerfstudio.workflow.choices import Choices, choose_length_and_scale, is_dataset
         from ssa_nerfstudio.workflow.photos_to_splats import DATASET, Plan, detect_with_progress
+        from ssa_nerfstudio.workflow.typed_options import errors_for_run, typed_for_run
 
         detecting, processing, _ = self.forwarded
-        detection = arguments.read(detect.Command, ["--data", str(self.photos), *detecting], "ssa detect", "")
-        detection.check()
+        with errors_for_run("detect"):
+            detection = arguments.read(detect.Command, ["--data", str(self.photos), *detecting], "ssa detect", "")
+            detection.check()
         work = None
         if is_dataset(self.photos):
             if processing:
@@ -152,22 +154,24 @@ class Command:
             longest = max(max(size.width, size.height) for size in sizes)
         else:
             words = ["--train", str(self.photos), "--output", str(self.output / DATASET), "--detect", *processing]
-            sources, work = arguments.read(process.Command, words, "ssa process", "").prepared()
+            with errors_for_run("process"):
+                sources, work = arguments.read(process.Command, words, "ssa process", "").prepared()
             longest = max(source.longest_side for source in sources)
             for source in sources:
                 if source.faces:
-                    console.print(cut_into_faces(source), markup=False)
+                    console.print(typed_for_run(cut_into_faces(source), "process"), markup=False)
         cameras = read_cameras(self.photos, detection.frames)
         steps, scale, warnings = choose_length_and_scale(longest, self.steps)
         choices = Choices(self.photos, self.method, steps, scale, *self.forwarded)
-        config = arguments.read(
-            tyro.conf.FlagConversionOff[SSATrainerConfig],
-            choices.training_options(self.output),
-            f"ns-train {self.method}",
-            "",
-            default=METHODS[self.method],
-        )
-        config.check()
+        with errors_for_run("train"):
+            config = arguments.read(
+                tyro.conf.FlagConversionOff[SSATrainerConfig],
+                choices.training_options(self.output),
+                f"ns-train {self.method}",
+                "",
+                default=METHODS[self.method],
+            )
+            config.check()
         config.pipeline.datamanager.data = config.data
         tests = partial(detect_with_progress, cameras, detection.threads, detection.draws)
         return choices, Plan(self.output, tests, work, choices.data(self.output), config, choices.record(), warnings)

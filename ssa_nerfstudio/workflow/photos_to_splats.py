@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import gc
 import json
-import re
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -26,7 +25,6 @@ from ssa_nerfstudio.cameras.intervals import BEGINNING
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
-from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.capture_detection import Camera, detect_camera
 from ssa_nerfstudio.evidence.detection import Detection
 from ssa_nerfstudio.evidence.verdict_in_words import verdict_in_words
@@ -132,12 +130,7 @@ def _process(
 ) -> Result:
     if plan.data.exists():  # complete: a run was killed before it recorded the stage
         return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
-    try:
-        summary = process(found_artifacts(plan.output / DETECTION), on_progress)
-    except InputError as error:  # its remedies are options of ssa process
-        raise InputError(
-            error.problem, re.sub(r"(?<!\S)(?<!ssa process )--(?=\w)", "--process.", error.remedy)
-        ) from error
+    summary = process(found_artifacts(plan.output / DETECTION), on_progress)
     registered, photos = sum(each.count for each in summary.passes), sum(each.photos for each in summary.passes)
     several = len(summary.passes) > 1
     missing = [f"{each.name}: {name}" if several else name for each in summary.passes for name in each.missing]

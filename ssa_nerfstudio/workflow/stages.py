@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from ssa_nerfstudio.data.writing import write_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
+from ssa_nerfstudio.workflow.typed_options import errors_for_run, typed_for_run
 
 
 @dataclass(frozen=True)
@@ -194,13 +195,15 @@ def run_stages(stages: Sequence[Stage], record: RunRecord, display: StageDisplay
             start = time.perf_counter()
 
             def told(decision: str, name: str = stage.name) -> None:
+                decision = typed_for_run(decision, name)
                 record.decide(name, decision)
                 display.tell(decision)
 
-            with _collected_warnings(told) as logged:
+            with errors_for_run(stage.name), _collected_warnings(told) as logged:
                 result = stage.work(partial(display.advance, stage.name))
             seconds = time.perf_counter() - start
-            warnings = (*result.warnings, *dict.fromkeys(entry.getMessage() for entry in logged))
+            logged = dict.fromkeys(typed_for_run(entry.getMessage(), stage.name) for entry in logged)
+            warnings = (*result.warnings, *logged)
             record.finish(FinishedStage(stage.name, seconds, result.text, warnings, files=result.files))
         display.finish(record.stages[stage.name], earlier)
 

@@ -183,9 +183,9 @@ def test_the_page_fits_a_narrow_window_and_its_line_can_be_moved(finished):
     ("options", "expected"),
     [
         (["--steps", "0"], "--steps must be at least 1"),
-        (["--detect.draws", "3"], "--draws must be at least 200"),
+        (["--detect.draws", "3"], "--detect.draws must be at least 200"),
         (["--train.pipeline.model.overlay", "maybe"], "(ns-train ssa-splatfacto --help)"),
-        (["--train.no-such-option", "1"], "Unrecognized options: --no-such-option"),
+        (["--train.no-such-option", "1"], "Unrecognized options: --train.no-such-option"),
         (["--nonsense", "1"], "Unrecognized options: --nonsense"),
         (
             ["--pipeline.model.overlay", "on"],
@@ -230,7 +230,7 @@ def test_a_folder_of_something_else_is_left_alone(tiny_scene, tmp_path, capsys):
 def test_options_of_structure_from_motion_are_checked_too(covered, tmp_path, capsys):
     with pytest.raises(SystemExit):
         run(covered, "--output", tmp_path / "out", "--process.matching", "all")
-    assert "invalid choice 'all' for argument '--matching'" in capsys.readouterr().err
+    assert "invalid choice 'all' for argument '--process.matching'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 
