@@ -42,6 +42,9 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 
+SUMMARY = Path("colmap", "summary.json")
+"""File of a dataset's `Summary`."""
+
 
 @dataclass(frozen=True)
 class Summary:
@@ -58,7 +61,21 @@ class Summary:
     repair: Repair | None = None
     """What became of the model that there was."""
     unmasked: bool = False
-    """Whether an artifact that was detected is not masked after all, because the photos fit better with its area."""
+    """Whether an artifact that was detected is not masked after all, because more photos register so."""
+
+    @staticmethod
+    def read(dataset: Path) -> Summary:
+        """Read that of a dataset that `process` has made.
+
+        Raises:
+            OSError, ValueError, TypeError, LookupError: it has none that can be read.
+        """
+        values = json.loads((dataset / SUMMARY).read_text(encoding="utf-8"))
+        passes = tuple(PassRegistration(**{**each, "missing": tuple(each["missing"])}) for each in values["passes"])
+        repair = values["repair"] and Repair(
+            **{key: tuple(value) if isinstance(value, list) else value for key, value in values["repair"].items()}
+        )
+        return Summary(**{**values, "passes": passes, "repair": repair})
 
 
 class _Mapped(NamedTuple):
@@ -170,11 +187,13 @@ def process(
             kept = {*json.loads((motion / KEPT).read_text(encoding="utf-8"))}
             now = {image.name for image in model.images.values() if image.has_pose}
             repair = Repair.of(known, photos[:train], masks, kept, now)
+        masked = float(np.mean([0.0 if mask is None else 1 - mask.mean() for mask in masks]))
+        error = model.compute_mean_reprojection_error()
+        summary = Summary(registered, model.num_points3D(), error, masked, repair, unmasked)
+        (dataset / SUMMARY).write_text(json.dumps(asdict(summary), indent=1) + "\n", encoding="utf-8")
         dataset.rename(output)
         work.remove()
-    masked = float(np.mean([0.0 if mask is None else 1 - mask.mean() for mask in masks]))
-    error = model.compute_mean_reprojection_error()
-    return Summary(registered, model.num_points3D(), error, masked, repair, unmasked)
+    return summary
 
 
 def _poses(known: ExistingModel, photos: Sequence[Sequence[Photo]]) -> dict[str, np.ndarray]:

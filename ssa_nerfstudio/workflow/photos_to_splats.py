@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import json
+import logging
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -42,6 +43,8 @@ from ssa_nerfstudio.workflow.detection_folder import VERDICTS, found_artifacts, 
 from ssa_nerfstudio.workflow.finished_training import evaluate, write_view_pictures
 from ssa_nerfstudio.workflow.resumable_training import config_file, load_trained, train
 from ssa_nerfstudio.workflow.stages import Result, Stage
+
+_LOG = logging.getLogger(__name__)
 
 DETECTION, DATASET, TRAINING, EVALUATION = "detection", "dataset", "training", "evaluation"
 """Folders of a run, one for each of the first four stages."""
@@ -118,19 +121,30 @@ def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
     with _emptied(plan.output / DETECTION) as staged:
         write_found(staged, found)
     sentences = [f"{name}: {verdict_in_words(detection)}" for name, detection in found.items()]
-    bare = [detection for detection in found.values() if detection.verdict == "none"]
-    missed = "a soft artifact has no edges; training looks again, with the scene's points, and says what it found"
-    return Result(
-        "; ".join(sentences) if len(found) > 1 else verdict_in_words(*found.values()), (missed,) if bare else ()
-    )
+    warnings = []
+    if weak := [name for name, detection in found.items() if detection.too_few_edges]:
+        of = f" of {name_list(weak)}" if len(found) > 1 else ""
+        warnings.append(
+            f"a small or faint artifact in the photos{of} may have been missed; if you see one there, add "
+            "--train.pipeline.model.overlay on"
+        )
+    if any(detection.verdict == "none" for detection in found.values()):
+        warnings.append(
+            "a soft artifact has no edges; training looks again, with the scene's points, and says what it found"
+        )
+    return Result("; ".join(sentences) if len(found) > 1 else verdict_in_words(*found.values()), tuple(warnings))
 
 
 def _process(
     plan: Plan, process: Callable[[Sequence[FoundArtifact], ProgressCallback], Summary], on_progress: ProgressCallback
 ) -> Result:
     if plan.data.exists():  # complete: a run was killed before it recorded the stage
-        return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
-    summary = process(found_artifacts(plan.output / DETECTION), on_progress)
+        try:
+            summary = Summary.read(plan.data)
+        except (OSError, ValueError, TypeError, LookupError):  # made by an earlier version
+            return Result(f"{len(Transforms.read(plan.data).frames)} photos have poses")
+    else:
+        summary = process(found_artifacts(plan.output / DETECTION), on_progress)
     registered, photos = sum(each.count for each in summary.passes), sum(each.photos for each in summary.passes)
     several = len(summary.passes) > 1
     missing = [f"{each.name}: {name}" if several else name for each in summary.passes for name in each.missing]
@@ -147,7 +161,7 @@ def _process(
 
 
 def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
-    began = train(plan.training, on_progress)
+    began = train(plan.training, on_progress, partial(warn_of_missed_artifacts, plan))
     _free_memory()
     checkpoint = Checkpoint.read(config_file(plan.training))
     layers = _layers(checkpoint)
@@ -156,32 +170,48 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     text = decided.get(overlays, f"the artifacts of {overlays} {kind} were learned with the scene")
     resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
     return Result(
-        f"{text}, in {checkpoint.step + 1:,} steps{resumed}", (*plan.training_warnings, *missed_artifacts(plan, layers))
+        f"{text}, in {checkpoint.step + 1:,} steps{resumed}", (*plan.training_warnings, *clear_overlays(layers))
     )
 
 
-def missed_artifacts(plan: Plan, layers: Sequence[ArtifactLayers]) -> list[str]:
-    """What detection found and the training has not learned, by the number of cameras: names may differ.
+def warn_of_missed_artifacts(plan: Plan, overlays: Sequence[str]) -> None:
+    """Warn, before the first step, of what detection found and the training has no overlay for.
 
-    Training tests undistorted photos, of a 360 degree camera the faces.
+    Training tests undistorted photos, of a 360 degree camera the faces. Names of cameras may differ, so they are
+    counted.
+
+    Args:
+        plan: the run.
+        overlays: names of those that are trained.
     """
-    groups = json.loads((plan.output / DETECTION / VERDICTS).read_text(encoding="utf-8"))["groups"]
-    found = [group["name"] for group in groups if group["verdict"] != "none"]
-    clear = [layer.name for layer in layers if (layer.straight()[1] > _MIN_MATTE).mean() < _MIN_COVERED]
-    warnings = []
+    verdicts = _verdicts(plan)
+    found = [name for name, verdict in verdicts.items() if verdict != "none"]
     # 360 degree photos are one camera for detection and up to six for training.
-    if len(found) > len({layer.name for layer in layers}) and plan.training.pipeline.model.overlay != "off":
-        warnings.append(
-            f"detection found an artifact in the photos of {name_list(found)}, the training in those of "
-            f"{name_list([layer.name for layer in layers]) or 'none'}; if one is left in the splats, run with "
-            "--train.pipeline.model.overlay on and another --output"
-        )
-    if clear:
-        warnings.append(
-            f"the overlay of {name_list(clear)} is nearly clear: what was found there may be left in the splats; look "
-            "at them, and add photos from other places"
-        )
-    return warnings
+    if len(found) <= len(overlays) or plan.training.pipeline.model.overlay == "off":
+        return
+    of = f" of {name_list(found)}" if len(verdicts) > 1 else ""
+    learned = f"those of {name_list(overlays)}" if overlays else "none"
+    _LOG.warning(
+        f"detection found an artifact in the photos{of}, the training in {learned}; if one is left in the splats, run "
+        "with --train.pipeline.model.overlay on and another --output"
+    )
+
+
+def clear_overlays(layers: Sequence[ArtifactLayers]) -> list[str]:
+    """Warnings of artifacts that the training was told of and has not learned."""
+    clear = [layer.name for layer in layers if (layer.straight()[1] > _MIN_MATTE).mean() < _MIN_COVERED]
+    if not clear:
+        return []
+    of = f" of {name_list(clear)}" if len(layers) > 1 else ""
+    return [
+        f"the overlay{of} is nearly clear: what was found there may be left in the splats; look at them, and add "
+        "photos from other places"
+    ]
+
+
+def _verdicts(plan: Plan) -> dict[str, str]:
+    groups = json.loads((plan.output / DETECTION / VERDICTS).read_text(encoding="utf-8"))["groups"]
+    return {group["name"]: group["verdict"] for group in groups}
 
 
 def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
 
@@ -23,12 +24,15 @@ def config_file(config: SSATrainerConfig) -> Path:
     return config.get_base_dir() / "config.yml"
 
 
-def train(config: SSATrainerConfig, on_progress: ProgressCallback) -> int:
+def train(
+    config: SSATrainerConfig, on_progress: ProgressCallback, on_start: Callable[[Sequence[str]], None] = lambda _: None
+) -> int:
     """Train up to the configuration's number of steps, from the newest checkpoint where there is one.
 
     Args:
         config: of a run whose folder has no time in its name, or a repeated call would start another one.
         on_progress: called after every step.
+        on_start: called before the first step with the names of the overlays (`Artifacts.name`).
 
     Returns:
         The step that it began at: 0, unless an earlier call left a checkpoint.
@@ -52,6 +56,8 @@ def train(config: SSATrainerConfig, on_progress: ProgressCallback) -> int:
             on_progress("step", step + 1, config.max_num_iterations)
 
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after_step))
+        artifacts = trainer.pipeline.model.artifacts
+        on_start([artifacts.name(group) for group in range(len(artifacts))])
         began = trainer._start_step
         trainer.train()
     finally:

@@ -30,6 +30,7 @@ class TerminalDisplay:
             console=console,
             disable=not console.is_terminal,
         )
+        self._warned: set[str] = set()
         self._tasks = {name: self.bars.add_task(name, total=None, start=False, said="") for name in names}
 
     def begin(self, stage: str) -> None:
@@ -44,13 +45,19 @@ class TerminalDisplay:
         """Print a decision above the bars."""
         self._console.print(decision, markup=False, emoji=False, highlight=False)
 
+    def warn(self, warning: str) -> None:
+        """Print a warning above the bars, once."""
+        if warning not in self._warned:
+            self._warned.add(warning)
+            self._console.print(f"[yellow]warning: {escape(warning)}[/yellow]", highlight=False)
+
     def finish(self, stage: FinishedStage, earlier: bool) -> None:
-        """Replace a stage's bar by what came out."""
+        """Replace a stage's bar by what came out, with the warnings that have not been shown."""
         self.bars.update(self._tasks[stage.name], visible=False)
         took = "done before" if earlier else str(timedelta(seconds=round(stage.seconds)))
         self._console.print(f"[bold]{stage.name:<10}[/bold] {took:>11}  {escape(stage.text)}", highlight=False)
         for warning in stage.warnings:
-            self._console.print(f"[yellow]warning: {escape(warning)}[/yellow]", highlight=False)
+            self.warn(warning)
 
 
 @contextmanager

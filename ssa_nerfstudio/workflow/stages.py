@@ -73,12 +73,19 @@ class StageDisplay(Protocol):
     def tell(self, decision: str) -> None:
         """What a stage decided by itself, while it works."""
 
+    def warn(self, warning: str) -> None:
+        """What the user should know, while a stage works; it is also among the finished stage's."""
+
     def finish(self, stage: FinishedStage, earlier: bool) -> None:
         """A stage is done, in this run or an earlier one."""
 
 
 class RunRecord:
-    """`run.json`: the stages that have begun, what each was asked for, what it decided, and what came out."""
+    """`run.json`: the stages that have begun, what each was asked for, what it decided and warned of, and what came
+    out.
+
+    Decisions and warnings are written at once: work that is continued after a kill does not repeat all of them.
+    """
 
     def __init__(self, path: Path) -> None:
         """Read or start the record.
@@ -93,6 +100,7 @@ class RunRecord:
         self.stages: dict[str, FinishedStage] = {}
         self._choices: dict[str, dict[str, Any]] = {}
         self._decisions: dict[str, list[str]] = {}
+        self._warnings: dict[str, list[str]] = {}
         check_run_folder(path)
         if not path.exists():
             self._write()
@@ -101,6 +109,7 @@ class RunRecord:
             for name, entry in json.loads(path.read_text(encoding="utf-8")).items():
                 self._choices[name] = dict(entry["choices"])
                 decided = self._decisions[name] = list(entry.get("decisions", []))
+                self._warnings[name] = list(entry.get("warnings", []))
                 if done := entry["done"]:
                     sequences = {key: tuple(done.get(key, ())) for key in ("warnings", "files")}
                     known = {**done, **sequences, "decisions": tuple(decided)}
@@ -127,7 +136,9 @@ class RunRecord:
                     )
 
     def begin(self, stage: Stage) -> None:
-        """Record what a stage is asked for."""
+        """Record what a stage is asked for; what it warned of when it was asked for something else is forgotten."""
+        if self._choices.get(stage.name) != stage.choices:
+            self._warnings.pop(stage.name, None)
         self._choices[stage.name] = stage.choices
         self._write()
 
@@ -137,16 +148,31 @@ class RunRecord:
         return [*stage.leaves, *(self._path.parent / file for file in (done.files if done else ()))]
 
     def decide(self, name: str, decision: str) -> None:
-        """Record at once what a stage decided: a training that is continued does not decide again."""
-        decided = self._decisions.setdefault(name, [])
-        if decision not in decided:
-            decided.append(decision)
-            self._write()
+        """Record what a stage decided."""
+        self._note(self._decisions.setdefault(name, []), decision)
+
+    def warn(self, name: str, warning: str) -> None:
+        """Record what a stage warned of."""
+        self._note(self._warnings.setdefault(name, []), warning)
+
+    def warnings(self, name: str) -> list[str]:
+        """What a stage warned of so far, each once."""
+        return [*self._warnings.get(name, [])]
+
+    def fail(self, name: str) -> None:
+        """Forget what a stage warned of that failed: the next attempt warns by itself."""
+        self._warnings.pop(name, None)
+        self._write()
 
     def finish(self, stage: FinishedStage) -> None:
         """Record what came out of a stage."""
         self.stages[stage.name] = replace(stage, decisions=tuple(self._decisions.get(stage.name, [])))
         self._write()
+
+    def _note(self, noted: list[str], text: str) -> None:
+        if text not in noted:
+            noted.append(text)
+            self._write()
 
     def _write(self) -> None:
         contents = {}
@@ -155,6 +181,7 @@ class RunRecord:
             contents[name] = {
                 "choices": choices,
                 "decisions": self._decisions.get(name, []),
+                "warnings": self._warnings.get(name, []),
                 "done": {key: done[key] for key in done if key not in ("name", "decisions")},
             }
         write_text(self._path, json.dumps(contents, indent=1) + "\n")
@@ -194,48 +221,52 @@ def run_stages(stages: Sequence[Stage], record: RunRecord, display: StageDisplay
             record.begin(stage)
             start = time.perf_counter()
 
-            def told(decision: str, name: str = stage.name) -> None:
-                decision = typed_for_run(decision, name)
-                record.decide(name, decision)
-                display.tell(decision)
-
-            with errors_for_run(stage.name), _collected_warnings(told) as logged:
-                result = stage.work(partial(display.advance, stage.name))
+            result = _worked(stage, record, display)
             seconds = time.perf_counter() - start
-            logged = dict.fromkeys(typed_for_run(entry.getMessage(), stage.name) for entry in logged)
-            warnings = (*result.warnings, *logged)
+            warnings = tuple(dict.fromkeys((*result.warnings, *record.warnings(stage.name))))
             record.finish(FinishedStage(stage.name, seconds, result.text, warnings, files=result.files))
         display.finish(record.stages[stage.name], earlier)
 
 
+def _worked(stage: Stage, record: RunRecord, display: StageDisplay) -> Result:
+    """Let a stage work; what the library logs meanwhile is recorded and shown at once."""
+
+    def told(message: str, is_warning: bool) -> None:
+        message = typed_for_run(message, stage.name)
+        if is_warning:
+            record.warn(stage.name, message)
+            display.warn(message)
+        else:
+            record.decide(stage.name, message)
+            display.tell(message)
+
+    try:
+        with errors_for_run(stage.name), _heard(told):
+            return stage.work(partial(display.advance, stage.name))
+    except Exception:
+        record.fail(stage.name)
+        raise
+
+
 @contextmanager
-def _collected_warnings(on_decision: Callable[[str], None]) -> Iterator[list[logging.LogRecord]]:
-    """Keep the library's warnings for the end of a stage; one that fails shows them at once.
+def _heard(on_message: Callable[[str, bool], None]) -> Iterator[None]:
+    """Hand over what the library logs: level INFO, which is what it decided (`plugin.decisions`), and warnings.
 
     Args:
-        on_decision: called with what the library logs at level INFO, which is what it decided (`plugin.decisions`).
+        on_message: called with the text and whether it is a warning.
     """
-    logged: list[logging.LogRecord] = []
 
-    class Collector(logging.Handler):
+    class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            if record.levelno < logging.WARNING:
-                on_decision(record.getMessage())
-            else:
-                logged.append(record)
+            on_message(record.getMessage(), record.levelno >= logging.WARNING)
 
     logger = logging.getLogger("ssa_nerfstudio")
-    collectors: list[logging.Handler] = [Collector(logging.INFO)]
-    former, logger.handlers = logger.handlers, collectors
+    listeners: list[logging.Handler] = [Listener(logging.INFO)]
+    former, logger.handlers = logger.handlers, listeners
     level = logger.level
     logger.setLevel(logging.INFO)
     try:
-        yield logged
-    except BaseException:
-        for handler in former:
-            for entry in logged:
-                handler.handle(entry)
-        raise
+        yield
     finally:
         logger.handlers = former
         logger.setLevel(level)

@@ -50,6 +50,7 @@ def test_what_is_known_is_masked_and_not_detected_again(capture, tmp_path):
     assert not used[-40:].any()
     assert used[:-44].all()
     assert summary.masked == pytest.approx(1 - used.mean())
+    assert Summary.read(tmp_path / "out") == summary
 
 
 def test_masks_that_hide_too_much_are_left_out(capture, tmp_path):

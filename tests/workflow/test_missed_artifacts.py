@@ -12,7 +12,7 @@ import pytest
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 from ssa_nerfstudio.workflow.detection_folder import VERDICTS
-from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, missed_artifacts
+from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, clear_overlays, warn_of_missed_artifacts
 
 
 def layers(name: str, covered: int) -> ArtifactLayers:
@@ -23,35 +23,47 @@ def layers(name: str, covered: int) -> ArtifactLayers:
     return ArtifactLayers(transmittance, np.zeros_like(transmittance), lens, "undistorted", "learned", name)
 
 
-def warnings(folder: Path, verdicts: dict[str, str], learned: list[ArtifactLayers], overlay: str = "auto") -> list[str]:
+def warn(folder: Path, caplog, verdicts: dict[str, str], overlays: list[str], overlay: str = "auto") -> list[str]:
+    """What is warned of where detection found this, and the training has overlays of these names."""
     (folder / DETECTION).mkdir()
     groups = [{"name": name, "verdict": verdict} for name, verdict in verdicts.items()]
     (folder / DETECTION / VERDICTS).write_text(json.dumps({"groups": groups}))
     model = SimpleNamespace(overlay=overlay)
     plan = SimpleNamespace(output=folder, training=SimpleNamespace(pipeline=SimpleNamespace(model=model)))
-    return missed_artifacts(plan, learned)  # type: ignore[arg-type]
+    warn_of_missed_artifacts(plan, overlays)  # type: ignore[arg-type]
+    return caplog.messages
 
 
 @pytest.mark.parametrize(
-    ("verdicts", "learned", "overlay"),
+    ("verdicts", "overlays", "overlay"),
     [
-        ({"front": "opaque", "side": "none"}, [layers("front", 5)], "auto"),
+        ({"front": "opaque", "side": "none"}, ["front"], "auto"),
         ({"front": "none"}, [], "auto"),
-        ({"front": "none"}, [layers("camera_0", 5)], "auto"),
-        ({"frame": "opaque"}, [layers("frame_down", 9), layers("frame_right", 2)], "auto"),
+        ({"front": "none"}, ["camera_0"], "auto"),
+        ({"frame": "opaque"}, ["frame_down", "frame_right"], "auto"),
         ({"front": "faint"}, [], "off"),
     ],
 )
-def test_there_is_none_where_all_was_learned_or_nothing_was_wanted(tmp_path, verdicts, learned, overlay):
-    assert warnings(tmp_path, verdicts, learned, overlay) == []
+def test_there_is_none_where_all_was_learned_or_nothing_was_wanted(tmp_path, caplog, verdicts, overlays, overlay):
+    assert warn(tmp_path, caplog, verdicts, overlays, overlay) == []
 
 
-def test_an_artifact_that_training_did_not_see_is_named_with_the_remedy(tmp_path):
-    (warning,) = warnings(tmp_path, {"camera_0": "faint", "camera_1": "opaque"}, [layers("camera_0", 5)])
-    assert "in the photos of camera_0, camera_1, the training in those of camera_0;" in warning
+@pytest.mark.parametrize(
+    ("verdicts", "overlays", "said"),
+    [
+        ({"left": "faint", "right": "opaque"}, ["left"], "the photos of left, right, the training in those of left;"),
+        ({"left": "faint", "right": "none"}, [], "the photos of left, the training in none;"),
+        ({"camera_0": "faint"}, [], "the photos, the training in none;"),
+    ],
+)
+def test_an_artifact_that_training_did_not_see_is_named_with_the_remedy(tmp_path, caplog, verdicts, overlays, said):
+    (warning,) = warn(tmp_path, caplog, verdicts, overlays)
+    assert said in warning
     assert "--train.pipeline.model.overlay on" in warning
 
 
-def test_an_overlay_that_stayed_clear_is_named(tmp_path):
-    (warning,) = warnings(tmp_path, {"frame": "opaque"}, [layers("frame_down", 9), layers("frame_right", 0)])
+def test_an_overlay_that_stayed_clear_is_named():
+    (warning,) = clear_overlays([layers("frame_down", 9), layers("frame_right", 0)])
     assert "the overlay of frame_right is nearly clear" in warning
+    assert clear_overlays([layers("frame_down", 9), layers("frame_right", 2)]) == []
+    assert clear_overlays([]) == []

@@ -19,6 +19,8 @@ from small_captures import HEIGHT, WIDTH, write
 
 from benchmarks import viewer_screenshots
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.workflow import photos_to_splats
 
 VIEWS = 16
 
@@ -88,12 +90,14 @@ def test_a_stage_that_was_killed_before_it_was_recorded_is_made_good(finished, c
     """Its files are there, in whole or in part, but the record does not have it."""
     record, files = finished / "run.json", {path: path.read_bytes() for path in finished.glob("*.p*")}
     contents = json.loads(record.read_text())
-    contents[stage]["done"] = {}
+    before, contents[stage]["done"] = contents[stage]["done"], {}
     record.write_text(json.dumps(contents))
     (finished / ".evaluation.left").mkdir()
     run(covered, "--output", finished, "--steps", "120", "--process.threads", "1")
     after = json.loads(record.read_text())
     assert {name for name in after if after[name]["done"]} == set(contents)
+    if stage != "train":  # which says that it was continued
+        assert {**after[stage]["done"], "seconds": 0} == {**before, "seconds": 0}
     assert {path: path.read_bytes() for path in finished.glob("*.p*")} == files
     assert (finished / ".evaluation.left").exists() == (stage != "evaluate")
     shutil.rmtree(finished / ".evaluation.left", ignore_errors=True)
@@ -160,6 +164,17 @@ def test_a_dataset_whose_test_photos_are_clean_and_options_of_its_stages(tiny_sc
     assert "carry the artifact" not in page
     assert "nerfstudio-data --eval-mode filename" in page
     assert "--draws 300" in page
+
+
+def test_a_missed_artifact_is_told_of_before_the_first_step(tiny_scene, tmp_path, monkeypatch, capsys):
+    def stop(plan: object, overlays: list[str]) -> None:
+        raise InputError(f"there are overlays {overlays}")
+
+    monkeypatch.setattr(photos_to_splats, "warn_of_missed_artifacts", stop)
+    with pytest.raises(SystemExit):
+        run(tiny_scene, "--output", tmp_path / "out", "--steps", 8)
+    assert "there are overlays ['camera_0']" in capsys.readouterr().err
+    assert not list(tmp_path.glob("out/training/*/nerfstudio_models/*"))
 
 
 @pytest.mark.browser

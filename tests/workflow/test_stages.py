@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import logging
 from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
-from ssa_nerfstudio._system.terminal_messages import show_warnings
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.decisions import tell
+from ssa_nerfstudio.workflow.stage_display import terminal_display
 from ssa_nerfstudio.workflow.stages import FinishedStage, Result, RunRecord, Stage, run_stages
 
 
@@ -19,7 +21,7 @@ class Shown:
     """Keeps what it is told."""
 
     def __init__(self) -> None:
-        self.parts, self.told, self.finished = [], [], []
+        self.parts, self.told, self.warned, self.finished = [], [], [], []
 
     def begin(self, stage: str) -> None:
         self.parts.append(stage)
@@ -29,6 +31,9 @@ class Shown:
 
     def tell(self, decision: str) -> None:
         self.told.append(decision)
+
+    def warn(self, warning: str) -> None:
+        self.warned.append(warning)
 
     def finish(self, stage: FinishedStage, earlier: bool) -> None:
         self.finished.append((stage.name, stage.text, stage.warnings, earlier))
@@ -148,22 +153,56 @@ def test_a_broken_record(tmp_path, text):
 
 
 @pytest.mark.parametrize("fails", [False, True])
-def test_what_the_library_warns_of_is_kept_with_the_stage(tmp_path, capsys, fails):
-    """A stage that fails has no place to keep it: then it is shown, as without stages."""
+def test_what_the_library_warns_of_is_shown_at_once_and_kept_with_the_stage(tmp_path, fails):
+    """What a stage warned of that failed is forgotten: it will warn again."""
 
     def do(on_progress) -> Result:
-        for _ in range(2):
-            logging.getLogger("ssa_nerfstudio.sfm").warning("two cameras are alike")
+        logging.getLogger("ssa_nerfstudio.sfm").warning("mask it with --mask")
+        assert shown.warned == ["mask it with --process.mask"]
+        logging.getLogger("ssa_nerfstudio.sfm").warning("mask it with --mask")
         if fails:
             raise InputError("broken")
         return Result("done", ("look",))
 
-    show_warnings()
-    shown = Shown()
+    record, shown = tmp_path / "run.json", Shown()
     with nullcontext() if not fails else pytest.raises(InputError):
-        run_stages([Stage("a", do)], RunRecord(tmp_path / "run.json"), shown)
-    assert shown.finished == ([] if fails else [("a", "done", ("look", "two cameras are alike"), False)])
-    assert ("two cameras are alike" in capsys.readouterr().err) == fails
+        run_stages([Stage("process", do)], RunRecord(record), shown)
+    warnings = ("look", "mask it with --process.mask")
+    assert shown.finished == ([] if fails else [("process", "done", warnings, False)])
+    assert json.loads(record.read_text())["process"]["warnings"] == ([] if fails else [warnings[1]])
+
+
+def test_warnings_outlive_a_stage_that_is_killed_and_not_repeated(tmp_path):
+    """As of a dataset that is complete when the process ends before it records the stage."""
+    killed = True
+
+    def do(on_progress) -> Result:
+        if killed:
+            logging.getLogger("ssa_nerfstudio.sfm").warning("two cameras are alike")
+            raise KeyboardInterrupt
+        return Result("done")
+
+    def run(**choices: object) -> tuple[str, ...]:
+        shown = Shown()
+        run_stages([Stage("process", do, choices)], RunRecord(tmp_path / "run.json"), shown)
+        return shown.finished[-1][2]
+
+    for choices, expected in (({}, ("two cameras are alike",)), ({"share": 0.5}, ())):
+        (tmp_path / "run.json").unlink(missing_ok=True)
+        killed = True
+        with pytest.raises(KeyboardInterrupt):
+            run()
+        killed = False
+        assert run(**choices) == expected
+
+
+def test_the_screen_shows_a_warning_once():
+    console = Console(width=80, record=True, file=io.StringIO())
+    with terminal_display(["a"], console) as display:
+        display.warn("two cameras [are] alike")
+        display.finish(FinishedStage("a", 1.0, "done", ("two cameras [are] alike", "look")), earlier=False)
+    lines = console.export_text().split("\n")
+    assert [line for line in lines if "warning" in line] == ["warning: two cameras [are] alike", "warning: look"]
 
 
 def test_what_a_stage_decided_is_told_at_once_and_outlives_a_stop(tmp_path):
