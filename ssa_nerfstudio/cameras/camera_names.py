@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import PurePosixPath
 
+from ssa_nerfstudio.cameras.intervals import capture_order
+
 
 def camera_names(photos: Sequence[Sequence[str]]) -> list[str]:
     """What the names of each camera's photos begin with, as in front_0001.jpg or images/front/1.jpg: "front".
@@ -15,12 +17,12 @@ def camera_names(photos: Sequence[Sequence[str]]) -> list[str]:
         photos: of each camera, paths relative to the dataset; at least one photo each.
 
     Returns:
-        A name for each camera; camera_0, camera_1, ... where it is the only one, or their photos' names do not tell
-        them apart.
+        A name for each camera, unlike the others'. Where their photos' names do not tell them apart, camera_of_ and the
+        name of its first photo; camera_0 for the only one.
     """
     if len(photos) == 1:
         return ["camera_0"]
-    for name in (_folder, _before_number, _first_words):
+    for name in (_folder, _before_number, _first_words, _first_photo):
         names = [name(each) for each in photos]
         if all(names) and len({*names}) == len(names):
             return names
@@ -43,3 +45,7 @@ def _first_words(photos: Sequence[str]) -> str:
     """Words with which all file names begin, up to the first number."""
     words = [re.findall(r"[^\W\d_]+", re.split(r"\d", PurePosixPath(photo).stem)[0]) for photo in photos]
     return "_".join(each[0] for each in takewhile(lambda each: len({*each}) == 1, zip(*words, strict=False)))
+
+
+def _first_photo(photos: Sequence[str]) -> str:
+    return f"camera_of_{PurePosixPath(min(photos, key=capture_order)).stem}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -98,8 +98,8 @@ def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
     """Find the photos or videos of one pass, a source for each camera that took them.
 
     A folder without photos and videos of its own is a rig's: each of its subfolders is a camera and names it. Photos of
-    several sizes or EXIF orientations in one folder are those of `camera_0`, `camera_1`, ...: an artifact has its place
-    in photos of one orientation.
+    several sizes or EXIF orientations in one folder are of several cameras, because an artifact has its place in photos
+    of one orientation: `landscape` and `portrait`, or by their size, 640x480.
 
     Args:
         path: a folder of photos or of videos, a folder of such folders, or one video.
@@ -122,8 +122,8 @@ def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
         groups = _by_frame(photos)
         if len(groups) > 1 and min(map(len, groups.values())) >= min_photos:
             return [
-                _of_photos(f"camera_{number}", path, group, frame, videos if number == 0 else [])
-                for number, (frame, group) in enumerate(groups.items())
+                _of_photos(called, path, group, frame, videos if number == 0 else [])
+                for number, (called, (frame, group)) in enumerate(zip(_called(groups), groups.items(), strict=True))
             ]
     return [read_source(path, name, min_photos)]
 
@@ -203,10 +203,26 @@ def _by_frame(photos: list[Path]) -> dict[_Frame, list[Path]]:
     return groups
 
 
-def _of_photos(name: str, path: Path, photos: list[Path], frame: _Frame, videos: list[Path]) -> Source:
+def _called(frames: Iterable[_Frame]) -> list[str]:
+    """What tells photos apart for those who took them: portrait or landscape, their size, or how it was held."""
+    sizes = [(*_upright(frame), frame[1]) for frame in frames]
+    shapes = [
+        "landscape" if width > height else "portrait" if width < height else "square" for width, height, _ in sizes
+    ]
+    by_size = [f"{width}x{height}" for width, height, _ in sizes]
+    for names in (shapes, by_size):
+        if len({*names}) == len(names):
+            return names
+    return [f"{name}_exif{orientation}" for name, (_, _, orientation) in zip(by_size, sizes, strict=True)]
+
+
+def _upright(frame: _Frame) -> tuple[int, int]:
     (width, height), orientation = frame
-    if orientation in _ON_THE_SIDE:
-        width, height = height, width
+    return (height, width) if orientation in _ON_THE_SIDE else (width, height)
+
+
+def _of_photos(name: str, path: Path, photos: list[Path], frame: _Frame, videos: list[Path]) -> Source:
+    (width, height), orientation = _upright(frame), frame[1]
     return Source(name, path, tuple(photos), (), width, height, orientation, tuple(videos))
 
 

@@ -33,9 +33,9 @@ LAYERS_FILE = "layers.npz"
 
 
 def write_overlay(folder: Path, checkpoint: Checkpoint, layers: list[ArtifactLayers], threshold: float) -> dict:
-    """Write overlay.json and the artifact of every camera, of several in folders camera_0, camera_1, ...
+    """Write overlay.json and the artifact of every camera, of several in folders called by the cameras.
 
-    Where the artifact changes, each interval has a folder, camera_0_interval_1, ...
+    Where the artifact changes, each interval has a folder, interval_1, ...
 
     Args:
         folder: exists and is empty.

@@ -130,12 +130,13 @@ class Artifacts(nn.Module):
         return same[interval_at(photo, [self.starts[other] for other in same])]
 
     def name(self, group: int) -> str:
-        """camera_0 or front, camera_0_interval_2 where its artifact changes; intervals are counted from 1."""
-        same, name = self._intervals(group), self.cameras[group]
+        """front, or camera_0 of the only camera; front_interval_2 or interval_2 where its artifact changes."""
+        same, camera = self._intervals(group), self.cameras[group]
         if len(same) == 1:
-            return name
+            return camera
         order = sorted(same, key=lambda other: capture_order(self.starts[other]))
-        return f"{name}_interval_{1 + order.index(group)}"
+        of = f"{camera}_" if len({*self.cameras}) > 1 else ""
+        return f"{of}interval_{1 + order.index(group)}"
 
     @property
     def changes(self) -> bool:

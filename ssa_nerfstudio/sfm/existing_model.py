@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -137,8 +136,9 @@ def _by_camera(
         exact = present[file].camera_id if file in present else camera
         members[exact if exact in own else camera].append(file)
     divided = []
-    for number, (camera, files) in enumerate(members.items()):
-        name = source.name if len(own) == 1 else f"{re.sub('^frame$', 'camera', source.name)}_{number}"
+    for camera, files in members.items():
+        folder = "" if source.name == "frame" else f"{source.name}_"
+        name = source.name if len(own) == 1 else f"{folder}colmap_camera_{camera}"
         cameras = [model.cameras[c] for c in ([camera] if used.count(camera) >= _MIN_PHOTOS else {*used})]
         lens = np.median([_lens(each) for each in cameras], axis=0).tolist()
         divided.append((replace(source, name=name, photos=tuple(files)), lens))

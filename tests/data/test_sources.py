@@ -95,11 +95,28 @@ def test_photos_in_portrait_and_landscape_are_two_cameras(tmp_path):
         Image.new("RGB", (64, 48)).save(tmp_path / f"{number}.png", exif=exif)
     landscape, portrait = read_sources(tmp_path, "frame", min_photos=3)
     assert [path.name for path in portrait.photos] == ["4.png", "5.png", "6.png"]
-    assert (landscape.name, landscape.width, landscape.height) == ("camera_0", 64, 48)
-    assert (portrait.name, portrait.width, portrait.height, portrait.orientation) == ("camera_1", 48, 64, 6)
+    assert (landscape.name, landscape.width, landscape.height) == ("landscape", 64, 48)
+    assert (portrait.name, portrait.width, portrait.height, portrait.orientation) == ("portrait", 48, 64, 6)
     (tmp_path / "6.png").unlink()
     with pytest.raises(InputError, match=r"4.png has EXIF orientation 6, 0.png has 1"):
         read_sources(tmp_path, "frame", min_photos=3)
+
+
+@pytest.mark.parametrize(
+    ("frames", "names"),
+    [
+        ([(64, 48, 1), (80, 60, 1)], ["64x48", "80x60"]),
+        ([(64, 48, 1), (80, 60, 1), (64, 48, 6)], ["64x48", "80x60", "48x64"]),
+        ([(64, 48, 1), (64, 48, 3)], ["64x48_exif1", "64x48_exif3"]),
+        ([(64, 64, 1), (64, 48, 1)], ["square", "landscape"]),
+    ],
+)
+def test_cameras_of_one_folder_are_called_by_what_tells_their_photos_apart(tmp_path, frames, names):
+    for number, (width, height, orientation) in enumerate(frames * 3):
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        Image.new("RGB", (width, height)).save(tmp_path / f"{number}.png", exif=exif)
+    assert [source.name for source in read_sources(tmp_path, "frame", min_photos=3)] == names
 
 
 def test_the_photos_of_one_camera_are_one_source(tmp_path):

@@ -88,7 +88,7 @@ def test_only_views_of_the_interval_have_an_overlay(trained, half):
     artifacts = pipeline.model.artifacts
     assert [artifacts.group_of_view(view) for view in range(24)] == [None] * HALF + [0] * HALF
     assert artifacts.changes
-    assert artifacts.name(0) == "camera_0_interval_2"
+    assert artifacts.name(0) == "interval_2"
     pipeline.eval()
     clean, behind = (
         pipeline.model.get_outputs_for_camera(camera)
@@ -120,7 +120,7 @@ def test_exports_know_which_photos_carry_it(trained, half, tmp_path):
     assert carrying[0] == checkpoint.artifacts().starts[0]
     main(["export-overlay", "--load-config", str(config), "--output", str(tmp_path / "artifact")])
     (camera,) = json.loads((tmp_path / "artifact/overlay.json").read_text())["cameras"]
-    assert (camera["name"], camera["photos_from"]) == ("camera_0_interval_2", carrying[0])
+    assert (camera["name"], camera["photos_from"]) == ("interval_2", carrying[0])
 
 
 def test_intervals_can_be_left_out(half, tmp_path, configure_training):
@@ -147,12 +147,12 @@ def test_one_that_is_replaced_has_an_overlay_for_each_interval(half, tmp_path, c
     trainer.setup()
     artifacts = trainer.pipeline.model.artifacts
     assert [artifacts.group_of_view(view) for view in range(24)] == [0] * HALF + [1] * HALF
-    assert [artifacts.name(group) for group in range(2)] == ["camera_0_interval_1", "camera_0_interval_2"]
+    assert [artifacts.name(group) for group in range(2)] == ["interval_1", "interval_2"]
     assert "2 intervals" in " ".join(capsys.readouterr().out.split())
     trainer.pipeline.eval()
     write_view_pictures(trainer.pipeline, tmp_path)
     assert {path.name for path in tmp_path.glob("photo-*.jpg")} == {"photo-1.jpg", "photo-2.jpg"}
     assert evaluate(trainer.pipeline, scene, lambda *_: None).pictured == [
-        PicturedGroup("from the first photo", "camera_0_interval_1"),
-        PicturedGroup(f"from {Path(artifacts.starts[1]).name}", "camera_0_interval_2"),
+        PicturedGroup("from the first photo", "interval_1"),
+        PicturedGroup(f"from {Path(artifacts.starts[1]).name}", "interval_2"),
     ]

@@ -97,7 +97,9 @@ def test_cameras_of_the_model(cameras, tmp_path, behind_dashboard):
     model_of(views, cameras).write_binary(tmp_path)
     known = read_existing_model(tmp_path, behind_dashboard, read_sources(behind_dashboard, "frame", 3))
     assert [len(source.photos) for source in known.sources] == ([6, 6] if cameras == 2 else [VIEWS])
-    assert [source.name for source in known.sources] == (["camera_0", "camera_1"] if cameras == 2 else ["frame"])
+    assert [source.name for source in known.sources] == (
+        ["colmap_camera_1", "colmap_camera_2"] if cameras == 2 else ["frame"]
+    )
     for number, lens in enumerate(known.lenses):
         center = number + 1 if cameras == 2 else np.median([1 + view for view in views])
         np.testing.assert_allclose(lens, [LENS + center, LENS + center, WIDTH / 2, HEIGHT / 2, 0, 0, 0, 0])
