@@ -30,6 +30,9 @@ from ssa_nerfstudio.plugin.face_overlaps import joined_overlays
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
+_KINDS = {"none": "soft", "faint": "semi-transparent", "opaque": "opaque, at least in part"}
+"""By detection's verdict, in the words of `evidence.verdict_in_words`; soft: seen by the scene's points alone."""
+
 NamedPhoto = tuple[str, dict[str, Any]]
 """Path relative to the dataset, and the photo with its mask as the datamanager caches them."""
 
@@ -76,7 +79,7 @@ def learned_overlays(
         faces: of a panorama, that the groups are; None where they are none.
     """
     learned: list[LearnedGroup] = []
-    verdicts: dict[int, str] = {}  # of faces, which may change
+    verdicts: dict[int, tuple[str, str]] = {}  # of faces, which may change
     photos_of = [[index for index, at in enumerate(groups) if at == camera] for camera in range(len(sizes))]
     called = camera_names([[names[index] for index in members] for members in photos_of])
     for group, (members, size, camera) in enumerate(zip(photos_of, sizes, called, strict=True)):
@@ -99,7 +102,7 @@ def learned_overlays(
                 None if gains is None else gains[interval],
                 size,
                 partial(_of_interval, withheld, group, starts, number),
-                tell if faces is None else partial(verdicts.__setitem__, len(learned)),
+                tell if faces is None else partial(_keep, verdicts, len(learned)),
             )
             if len(intervals) > 1:
                 first, last = Path(names[interval[0]]).name, Path(names[interval[-1]]).name
@@ -111,14 +114,19 @@ def learned_overlays(
         joined = joined_overlays(faces, [each.overlay for each in learned], config.overlay_downscale)
         for index, overlay in joined.items():
             if learned[index].overlay is None:
-                verdicts[index] = (
+                reaches = (
                     f"The artifact reaches into the photos of {learned[index].camera} from the face beside them: "
                     "training with an overlay. (--pipeline.model.overlay off trains without.)"
                 )
+                verdicts[index] = reaches, reaches
             learned[index] = replace(learned[index], overlay=overlay)
     for verdict in verdicts.values():
-        tell(verdict)
+        tell(*verdict)
     return learned
+
+
+def _keep(verdicts: dict[int, tuple[str, str]], index: int, verdict: str, brief: str) -> None:
+    verdicts[index] = verdict, brief
 
 
 @dataclass(frozen=True)
@@ -133,8 +141,8 @@ class _Part:
     gains: torch.Tensor | None
     size: tuple[int, int]
     withheld: Callable[[], list[NamedPhoto]]
-    say: Callable[[str], None]
-    """Takes the verdict in one line."""
+    say: Callable[[str, str], None]
+    """Takes the verdict in one line, and its brief form (`decisions.tell`)."""
 
     @property
     def images(self) -> list[dict[str, Any]]:
@@ -191,9 +199,9 @@ def _learned_overlay(
         if detection.verdict == "none" and share < MIN_SHARE and not known:
             if part.artifact_in_all():
                 return _learned_overlay(config, part, statistics, points, "with the test photos")
-            part.say(_in_words(detection, share, part.name))
+            part.say(*_in_words(detection, share, part.name))
             return None
-        part.say(_in_words(detection, share, part.name, known))
+        part.say(*_in_words(detection, share, part.name, known))
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide)
@@ -254,18 +262,20 @@ def _report_changes(starts: list[str], name: str) -> None:
     )
 
 
-def _in_words(detection: Detection, share: float, name: str, known: str = "") -> str:
-    """The verdict in one line, with the option that overrides it."""
+def _in_words(detection: Detection, share: float, name: str, known: str = "") -> tuple[str, str]:
+    """The verdict in one line, with the option that overrides it, and without what detection alone would say, too."""
     name = name[0].upper() + name[1:]
     if detection.verdict != "none" or share >= MIN_SHARE or known:
-        what = f"{detection.verdict}, {detection.coverage:.1%}" if detection.verdict != "none" else f"soft, {share:.1%}"
-        return (
-            f"{name} have a static artifact{known and f', {known}'} ({what} of the frame): training with an overlay. "
-            "(--pipeline.model.overlay off trains without.)"
-        )
+        covered = detection.coverage if detection.verdict != "none" else share
+        # Detection, which sees the photos as they were taken, has another share of another frame.
+        what = f" ({_KINDS[detection.verdict]}, {covered:.1%} of the undistorted frame)"
+        told, decided = f"{name} have a static artifact{known and f', {known}'}", "training with an overlay. "
+        decided += "(--pipeline.model.overlay off trains without.)"
+        return f"{told}{what}: {decided}", f"{told}{what if detection.verdict == 'none' else ''}: {decided}"
     reason = "too few to tell" if detection.views < MIN_VIEWS else "as many static edges as chance has"
     reason = "some edges stand still, but too few to be one" if detection.too_few_edges else reason
-    return (
+    text = (
         f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"
     )
+    return text, text

@@ -151,7 +151,7 @@ def _process(
     warning = f"no pose was found for {name_list(missing)}; where parts of the "
     warning += "scene are missing, add photos between them and their neighbors"
     repaired = "" if summary.repair is None else f"; of the model, {summary.repair.in_words()}"
-    masked = f"; {summary.masked:.0%} of the frame, the artifact and a rim, was masked" if summary.masked else ""
+    masked = "; found off the artifact" if summary.masked else ""
     masked = "; more photos have poses without a mask of the artifact" if summary.unmasked else masked
     return Result(
         f"{registered} of {photos} photos have poses, {summary.points:,} points, mean reprojection error "

@@ -258,7 +258,8 @@ def _heard(on_message: Callable[[str, bool], None]) -> Iterator[None]:
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            on_message(record.getMessage(), record.levelno >= logging.WARNING)
+            text = getattr(record, "brief", record.getMessage())
+            on_message(text, record.levelno >= logging.WARNING)
 
     logger = logging.getLogger("ssa_nerfstudio")
     listeners: list[logging.Handler] = [Listener(logging.INFO)]
