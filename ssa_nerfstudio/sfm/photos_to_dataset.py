@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import combinations
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -70,11 +70,9 @@ class Summary:
         Raises:
             OSError, ValueError, TypeError, LookupError: it has none that can be read.
         """
-        values = json.loads((dataset / SUMMARY).read_text(encoding="utf-8"))
-        passes = tuple(PassRegistration(**{**each, "missing": tuple(each["missing"])}) for each in values["passes"])
-        repair = values["repair"] and Repair(
-            **{key: tuple(value) if isinstance(value, list) else value for key, value in values["repair"].items()}
-        )
+        values = _with_tuples(json.loads((dataset / SUMMARY).read_text(encoding="utf-8")))
+        passes = tuple(PassRegistration(**each) for each in values["passes"])
+        repair = values["repair"] and Repair(**values["repair"])
         return Summary(**{**values, "passes": passes, "repair": repair})
 
 
@@ -129,7 +127,7 @@ def process(
     cameras = [camera for source in sources for camera in source.cameras]
     train, sources = len(cameras), [*sources, *([clean] if clean is not None else [])]
     names = [camera.name for source in sources for camera in source.cameras]
-    masks: list[np.ndarray | None] = [None] * train
+    masks: Sequence[np.ndarray | None] = [None] * train
     if mask is not None:
         masks = [mask if face is None else cut(mask.astype(np.float32), face) > 0.5 for _, face in cameras]
         masks = [widened(each) for each in masks if each is not None]
@@ -194,6 +192,13 @@ def process(
         dataset.rename(output)
         work.remove()
     return summary
+
+
+def _with_tuples(value: Any) -> Any:
+    """JSON values whose lists are tuples."""
+    if isinstance(value, dict):
+        return {key: _with_tuples(each) for key, each in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
 def _poses(known: ExistingModel, photos: Sequence[Sequence[Photo]]) -> dict[str, np.ndarray]:
