@@ -66,9 +66,7 @@ def test_numbers_are_read_as_in_yaml_1_2(text, number, tmp_path):
 def test_values_that_refer_to_themselves_are_refused(tmp_path):
     path = tmp_path / "x.yaml"
     path.write_text("rate: 1\nfree: &a [*a]")
-    with pytest.raises(
-        InputError, match=r"x\.yaml is no valid YAML \(with its aliases it holds more than 100000"
-    ):
+    with pytest.raises(InputError, match=r"x\.yaml is no valid YAML \(with its aliases it holds more than 100000"):
         read(path)
     values: dict = {"rate": 1}
     values["free"] = values
