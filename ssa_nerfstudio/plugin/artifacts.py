@@ -219,10 +219,9 @@ class Artifacts(nn.Module):
         self._allocate_falloffs(state, prefix)
 
     def _allocate_falloffs(self, state: dict[str, Any], prefix: str) -> None:
-        for g, overlay in enumerate(self.overlays):
-            if isinstance(overlay, ScreenSpaceOverlay):
-                without = state[f"{prefix}overlays.{g}.falloff"].numel() == 1
-                overlay.falloff = overlay.falloff.new_ones((1, 1, 1) if without else overlay.evidence.shape)
+        for g, overlay in enumerate(self.learned()):  # all of them, or none
+            without = state[f"{prefix}overlays.{g}.falloff"].numel() == 1
+            overlay.falloff = overlay.falloff.new_ones((1, 1, 1) if without else overlay.evidence.shape)
 
     def resume_from(
         self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str, photos: list[str]
