@@ -86,8 +86,10 @@ class Video:
             if spacing > 1 and abs(offset) > max(_WINDOW / 2, 0.5 / spacing):
                 continue
             decoded, frame = capture.retrieve()
-            sharpness = _sharpness(frame) if decoded else -1.0
-            if decoded and (best is None or sharpness > best[0]):
+            if not decoded:
+                continue
+            sharpness = _sharpness(frame)
+            if best is None or sharpness > best[0]:
                 best = sharpness, number, frame
         capture.release()
         if best is not None:

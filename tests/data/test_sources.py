@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from ssa_nerfstudio.data.sources import read_source, read_sources
+from ssa_nerfstudio.data.video import Video
 from ssa_nerfstudio.errors import InputError
 
 
@@ -42,6 +43,32 @@ def test_videos_beside_photos_are_skipped(tmp_path):
     source = read_source(tmp_path, "frame", min_photos=3)
     assert [path.name for path in source.skipped_videos] == ["1.avi"]
     assert len(source.photos) == 3
+
+
+def test_frames_that_cannot_be_decoded_are_passed_over(tmp_path, monkeypatch):
+    write_video(tmp_path / "a.avi", 12)
+    video = Video.read(tmp_path / "a.avi")
+
+    class Broken:
+        """Every third frame is damaged."""
+
+        def __init__(self, path: str) -> None:
+            self.number = -1
+
+        def grab(self) -> bool:
+            self.number += 1
+            return self.number < 12
+
+        def retrieve(self) -> tuple[bool, np.ndarray | None]:
+            damaged = self.number % 3 == 0
+            return not damaged, None if damaged else np.full((48, 64, 3), self.number, np.uint8)
+
+        def release(self) -> None:
+            pass
+
+    monkeypatch.setattr(cv2, "VideoCapture", Broken)
+    numbers = [number for number, _ in video.sharpest(12)]
+    assert numbers == [1, 2, 4, 5, 7, 8, 10, 11]
 
 
 def test_another_file_or_a_changed_one_has_another_fingerprint(tmp_path):

@@ -15,7 +15,7 @@ from conftest import edit_transforms
 from PIL import Image
 
 from ssa_nerfstudio.cli import main
-from ssa_nerfstudio.evidence.capture_detection import read_cameras
+from ssa_nerfstudio.evidence.capture_detection import detect_camera, read_cameras
 
 
 def photos(folder: Path, count: int = 14, artifact: bool = True, size: tuple[int, int] = (64, 96)) -> Path:
@@ -54,6 +54,12 @@ def test_a_folder_of_photos_is_enough(tmp_path, capsys):
     said = capsys.readouterr().out
     assert f"a static artifact over {group['coverage']:.1%} of the frame, opaque" in said
     assert f"Train with an overlay: ssa run {data} --output OUT" in said
+
+
+def test_detection_needs_no_console(tmp_path, capsys):
+    (camera,) = read_cameras(photos(tmp_path / "photos"), 200)
+    assert detect_camera(camera, threads=1).verdict == "opaque"
+    assert capsys.readouterr() == ("", "")
 
 
 def test_clean_photos_give_none_and_a_white_mask(tmp_path, capsys):

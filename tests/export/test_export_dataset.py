@@ -9,6 +9,8 @@ import json
 import re
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,6 +25,8 @@ from small_checkpoints import cameras, write_run
 
 from ssa_nerfstudio.cameras.lens import Lens, distort, undistort, undistorted_lens
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.export.capture_artifact import DetectedArtifact
 from ssa_nerfstudio.export.trainer_presets import PRESETS
 from ssa_nerfstudio.overlay.layer import OracleOverlay
 
@@ -325,6 +329,14 @@ def test_a_fisheye_goes_through_raw_and_undistorted(tmp_path, photos):
         (camera,) = pycolmap.Reconstruction(folder / "sparse/0").cameras.values()
         assert camera.model.name == model
         assert agree(opened(folder / "images/1_mask.png") > 0, true > 0.5)
+
+
+def test_detection_alone_restores_no_photo():
+    lens = LENSES["front"]
+    photo = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    detection: Any = SimpleNamespace(mask=torch.zeros(HEIGHT, WIDTH, dtype=torch.bool))
+    with pytest.raises(InputError, match="not its color; give --load-config"):
+        DetectedArtifact([lens], [detection]).restored(photo, "images/0.png", lens, "raw")
 
 
 def test_every_preset_says_where_it_comes_from():

@@ -141,6 +141,13 @@ def test_shipped_benchmarks_can_be_planned(name):
         assert plan_tradeoff(stated)
 
 
+def test_a_tradeoff_puts_nothing_in_front_of_a_scene_that_carries_an_artifact():
+    road = SceneEntry("road", artifact="bonnet")
+    tradeoff = Tradeoff(("barn", "road"), knobs={"overlay_downscale": [2]}, effect="mud", marks=4)
+    runs = plan_tradeoff(benchmark(scenes=(*benchmark().scenes, road), tradeoff=tradeoff))
+    assert [(run.scene, run.effect) for run in runs] == [*2 * [("barn", "mud")], *2 * [("road", "bonnet")]]
+
+
 def test_a_tradeoff_varies_one_knob_at_a_time_and_repeats_no_base():
     knobs = {"steps": [700, 7000], "overlay_downscale": [1, 2], "densification": ["mcmc"]}
     tradeoff = Tradeoff(

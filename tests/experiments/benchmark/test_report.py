@@ -117,6 +117,9 @@ def test_captures_with_the_artifact_on_their_test_photos_are_judged_by_their_mas
     report([folder_of(tmp_path, results)], tmp_path / "report")
     text = (tmp_path / "report" / "report.md").read_text()
     assert text.count("By a mask of the artifact") == 1
+    assert "| outside: PSNR ↑ | median | worst view |" in text
+    assert "## What this is made of" in text
+    assert "| device | torch | gsplat | revision | runs |" in text
     assert "test photos with the artifact" in text
 
 

@@ -1,0 +1,29 @@
+"""The commands that a run's page lists: each is taken by the command that it calls."""
+
+from __future__ import annotations
+
+import importlib
+import shlex
+import shutil
+from pathlib import Path
+
+from ssa_nerfstudio.cli import arguments
+from ssa_nerfstudio.workflow.choices import Choices
+from ssa_nerfstudio.workflow.photos_to_splats import DATASET
+
+
+def test_commands_of_ssa_are_taken_with_the_paths_of_the_run(tiny_scene, tmp_path):
+    output, photos = tmp_path / "out", tmp_path / "my photos"
+    shutil.copytree(tiny_scene, output / DATASET)
+    choices = Choices(photos, "ssa-splatfacto", 120, 1.0, ("--draws", "300"), ("--threads", "1"))
+    config = output / "training/ssa-splatfacto/config.yml"
+    read = {}
+    for name, command in choices.commands(output, config).items():
+        program, called, *options = shlex.split(command)
+        if program == "ssa":
+            module = importlib.import_module(f"ssa_nerfstudio.cli.{called.replace('-', '_')}")
+            read[name] = arguments.read(module.Command, options, f"ssa {called}", "")
+    assert (read["Detect"].data, read["Detect"].draws) == (Path("../my photos"), 300)
+    assert (read["Poses"].train, read["Poses"].output) == (Path("../my photos"), Path("again/dataset"))
+    assert read["Poses"].threads == 1
+    assert read["Splats"].load_config == Path("training/ssa-splatfacto/config.yml")
