@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.mutation.picking import quickest_first, statement
 
-FUNCTION = '''
+FUNCTION: list[str] = '''
     def f(a,
           b=2):
         """What it does."""
