@@ -11,6 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.evidence.changing_area import MIN_OPACITY, changing_area
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
@@ -22,8 +23,6 @@ from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 STATISTICS_SCALE = 0.05
 """s of the paper: a standard deviation of s over the views gives an initial matte of 1 / e."""
-MIN_OPACITY = 0.1
-"""Estimated opacities below this are noise: such pixels start clear."""
 
 
 @torch.no_grad()
@@ -95,6 +94,15 @@ def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide:
     initialize_as(overlay, torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
     if (falloff < 1).any():
         overlay.falloff = _at_overlay_resolution(falloff, overlay).to(overlay.falloff)
+
+
+@torch.no_grad()
+def ignore_changing(overlay: ScreenSpaceOverlay, estimate: LayerEstimate) -> None:
+    """Let the scene learn nothing where the artifact changes from photo to photo; the overlay is changed in place."""
+    if (area := changing_area(estimate)).any():
+        reduction = working_reduction(overlay.height, overlay.width)
+        kept = torch.from_numpy(~area)[..., None].to(overlay.reliable)
+        overlay.reliable = _at_overlay_resolution(enlarged(kept, overlay.height, overlay.width, reduction), overlay)
 
 
 @torch.no_grad()

@@ -50,6 +50,12 @@ class LayerEstimate:
     """B [h, w, 3] in [0, 1]."""
     falloff: Tensor
     """F [h, w, 1] in (0, 1]: of the lens, see `falloff.estimate_falloff`."""
+    unexplained: Tensor
+    """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers."""
+
+    def opacity(self) -> Tensor:
+        """The least matte [h, w, 1] that explains T and B."""
+        return smallest_matte(self.transmittance, self.addition)
 
     def share(self) -> float:
         """Share of the frame that is hidden or lit by more than CERTAIN_OPACITY."""
@@ -123,7 +129,11 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
         others = (total[:, 3:][point] - seen[:, 3:]).clamp_min(1e-6)
         uncertainty = transmitted.square() / others
         residual = observed - transmitted * colors[point] - added
-    return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]))
+    outliers = residual.square().mean(dim=-1, keepdim=True) > (OUTLIER_SCALE * scale) ** 2
+    counts = torch.cat([outliers.to(residual), torch.ones_like(residual[:, :1])], dim=-1)
+    around = local_mean(_sums(pixel, counts, height * width).reshape(height, width, 2), DETAIL_RADIUS // 2)
+    unexplained = around[..., :1] / around[..., 1:].clamp_min(1e-9)
+    return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained)
 
 
 def _initial_residual(samples: PointSamples, clear: Tensor, constant: Tensor) -> Tensor:

@@ -26,6 +26,8 @@ scene behind an opaque pixel loses all gradient. 0.999 is 255 in 8 bits, and gsp
 oracle overlay has no such range."""
 COLOR_LOGIT_RANGE = (-12.0, 12.0)
 """Range of the learned color's logits: 6e-6 to 1 - 6e-6, for the same reason."""
+OPTIONAL_MAPS = ("falloff", "reliable")
+"""Buffers of an overlay that have one pixel where they change nothing."""
 
 
 class ScreenSpaceOverlay(nn.Module):
@@ -42,6 +44,9 @@ class ScreenSpaceOverlay(nn.Module):
     """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the artifact was found."""
     falloff: Tensor
     """F [h, w, 1] in (0, 1] of the lens (`evidence.falloff`); [1, 1, 1] of value 1 for none."""
+    reliable: Tensor
+    """[h, w, 1] in [0, 1]: 0 where the artifact changes (`evidence.changing_area`), and the scene gets no gradient;
+    [1, 1, 1] of value 1 for nowhere."""
 
     def __init__(self, height: int, width: int, resolution: int = 1, adds_light: bool = False) -> None:
         """Create an overlay with constant color and matte.
@@ -59,6 +64,7 @@ class ScreenSpaceOverlay(nn.Module):
         self.register_buffer("frame", torch.tensor([height, width, resolution, int(adds_light)]))
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.register_buffer("falloff", torch.ones(1, 1, 1))
+        self.register_buffer("reliable", torch.ones(1, 1, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
 
     @torch.no_grad()
@@ -106,6 +112,8 @@ class ScreenSpaceOverlay(nn.Module):
         Returns:
             I, of the render's shape; not clipped.
         """
+        if self.reliable.numel() > 1 and clean.requires_grad:
+            clean = torch.lerp(clean.detach(), clean, self._at_training_scale(self.reliable, reduction))
         if self.resolution == reduction == 1 and not self.adds_light:
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         else:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order, interval_at
 from ssa_nerfstudio.data.photos import MAX_PIXELS
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
+from ssa_nerfstudio.overlay.layer import OPTIONAL_MAPS, OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES, find_frame, match_camera, nearest_aspect
 from ssa_nerfstudio.plugin.view_geometry import metadata
@@ -113,8 +113,7 @@ class Artifacts(nn.Module):
         """Transmittance and addition of any camera, or None where it has no overlay.
 
         A camera with the frame of a group shows that group's overlay, and one whose photo is known (`photo` of its
-        metadata) that of its interval. A free viewpoint shows the one of its aspect, or the first. `group` overrides
-        all.
+        metadata) that of its interval; a free viewpoint the one of its aspect, or the first; `group` overrides all.
         """
         if group is None:
             group = match_camera(camera, self._keys + self._bare)
@@ -186,8 +185,8 @@ class Artifacts(nn.Module):
             if len(state[f"{overlay}frame"]) == 3:  # checkpoints from before additive light
                 state[f"{overlay}frame"] = F.pad(state[f"{overlay}frame"], (0, 1))
             state.pop(f"{overlay}near", None)  # checkpoints from before the estimate from points
-            if f"{overlay}alpha_logits" in state:  # checkpoints from before falloffs of their own
-                state.setdefault(f"{overlay}falloff", torch.ones(1, 1, 1))
+            for name in OPTIONAL_MAPS if f"{overlay}alpha_logits" in state else ():  # earlier checkpoints have none
+                state.setdefault(overlay + name, torch.ones(1, 1, 1))
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
         for height, width, *_ in frames:
             if not 0 < height * width <= MAX_PIXELS:
@@ -201,7 +200,7 @@ class Artifacts(nn.Module):
                     f"adds light) {frames or 'absent'}, this run's are {here or 'absent'}",
                     "resume with the photos, camera-res-scale-factor and overlay options it was trained with",
                 )
-            self._allocate_falloffs(state, prefix)
+            self._allocate_optional(state, prefix)
             return
         if frames and not wanted:
             raise InputError(
@@ -216,12 +215,13 @@ class Artifacts(nn.Module):
         ).to(device)
         for name in ("camera_keys", "lenses", "bare_keys"):
             setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))
-        self._allocate_falloffs(state, prefix)
+        self._allocate_optional(state, prefix)
 
-    def _allocate_falloffs(self, state: dict[str, Any], prefix: str) -> None:
+    def _allocate_optional(self, state: dict[str, Any], prefix: str) -> None:
         for g, overlay in enumerate(self.learned()):  # all of them, or none
-            without = state[f"{prefix}overlays.{g}.falloff"].numel() == 1
-            overlay.falloff = overlay.falloff.new_ones((1, 1, 1) if without else overlay.evidence.shape)
+            for name in OPTIONAL_MAPS:
+                without = state[f"{prefix}overlays.{g}.{name}"].numel() == 1
+                setattr(overlay, name, torch.ones_like(overlay.evidence[:1, :1] if without else overlay.evidence))
 
     def resume_from(
         self, state: dict[str, Any], prefix: str, keys: Tensor, groups: list[int], setting: str, photos: list[str]

@@ -20,7 +20,13 @@ from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
-from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize, initialize_from
+from ssa_nerfstudio.evidence.initialization import (
+    estimate,
+    guide_of,
+    ignore_changing,
+    initialize,
+    initialize_from,
+)
 from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
@@ -205,6 +211,8 @@ def _learned_overlay(
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide)
+        if config.ignore_changing:
+            ignore_changing(started, found)
         return started
     started = overlay(light)
     if by_points:

@@ -50,6 +50,9 @@ class ModelSettings(SplatfactoModelConfig):
     ignore_background: bool = True
     """Take the matte's gradient as if the overlay's color were the background, so that hiding background that no
     splat covers (a sky without points) is not rewarded; False: plain compositing, as in the paper."""
+    ignore_changing: bool = True
+    """Where the estimate from points finds an artifact that changes from photo to photo, such as a weapon that sways,
+    the photos teach the scene nothing; False: they do."""
     strategy: Literal["adc", "mcmc"] = "adc"
     """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
     cap_max: int = 1_000_000

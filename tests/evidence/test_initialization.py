@@ -116,7 +116,7 @@ def estimated(height: int, width: int, transmittance: float, addition: tuple[flo
     """Layers on the left half, nothing on the right half but a little noise."""
     T, B = torch.full((height, width, 1), 0.97), torch.full((height, width, 3), 0.02)
     T[:, : width // 2], B[:, : width // 2] = transmittance, torch.tensor(addition)
-    return LayerEstimate(T, B, torch.ones_like(T))
+    return LayerEstimate(T, B, torch.ones_like(T), torch.zeros_like(T))
 
 
 @pytest.mark.parametrize("resolution", [1, 2])

@@ -161,6 +161,27 @@ def test_a_falloff_darkens_scene_and_artifact_alike_and_is_no_concern_of_sparsit
     assert torch.equal(overlay.opacity(), opacity)
 
 
+@pytest.mark.parametrize("adds_light", [False, True])
+@pytest.mark.parametrize("reduction", [1, 2])
+def test_the_scene_learns_nothing_where_the_artifact_changes_and_the_overlay_does(
+    reduction: int, adds_light: bool
+) -> None:
+    overlay = randomized(12, 16, 1, adds_light)
+    clean = random(12 // reduction, 16 // reduction, 3).requires_grad_()
+    with_all = overlay.composite(clean, reduction)
+    overlay.reliable = torch.ones(12, 16, 1)
+    overlay.reliable[:, 8:] = 0
+    image = overlay.composite(clean, reduction)
+    assert torch.equal(image, with_all)
+    (before,) = torch.autograd.grad(with_all.sum(), clean)
+    image.sum().backward()
+    assert clean.grad is not None
+    assert overlay.alpha_logits.grad is not None
+    torch.testing.assert_close(clean.grad[:, : 8 // reduction], before[:, : 8 // reduction])
+    assert (clean.grad[:, 8 // reduction :] == 0).all()
+    assert (overlay.alpha_logits.grad[:, 8:] != 0).all()
+
+
 def test_a_state_dict_of_another_frame_is_refused() -> None:
     with pytest.raises(RuntimeError, match="size mismatch"):
         ScreenSpaceOverlay(9, 13).load_state_dict(ScreenSpaceOverlay(13, 9).state_dict())
@@ -280,4 +301,4 @@ def test_a_camera_of_many_pixels_says_its_size(adds_light: bool) -> None:
     overlay = ScreenSpaceOverlay(5, 7, 2, adds_light)
     assert overlay.frame.tolist() == [5, 7, 2, int(adds_light)]
     assert overlay.frame.dtype == torch.int64
-    assert set(overlay.state_dict()) == {"color_logits", "alpha_logits", "frame", "evidence", "falloff"}
+    assert set(overlay.state_dict()) == {"color_logits", "alpha_logits", "frame", "evidence", "falloff", "reliable"}
