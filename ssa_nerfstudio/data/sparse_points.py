@@ -36,13 +36,13 @@ def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
 
 
 def check_points(path: Path) -> None:
-    """Check that a PLY file holds as many colored points as it states, at finite places.
+    """Check that a PLY file holds as many colored points as it states, at least one of them at a finite place.
 
     open3d, which nerfstudio reads it with, gives no points where the header is broken and zeros for points that are
     cut off.
 
     Raises:
-        InputError: the file is missing, no PLY, empty or truncated, or a coordinate is no finite number.
+        InputError: the file is missing, no PLY, empty or truncated, a coordinate is no number, or no point is finite.
     """
     try:
         if path.is_fifo():
@@ -61,8 +61,8 @@ def check_points(path: Path) -> None:
             points = _coordinates(file, kind, count, properties)
             if len(points) < count:
                 raise ValueError(f"it holds {len(points)} of the {count} points that it states")
-            if wrong := int((~np.isfinite(points).all(axis=1)).sum()):
-                raise ValueError(f"{wrong} of its {count} points are not finite")
+            if not np.isfinite(points).all(axis=1).any():  # a training leaves single ones out
+                raise ValueError(f"none of its {count} points is finite")
     except (OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as sparse points ({error})", _REMEDY) from error
 

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.mutation.picking import quickest_first, statement
 
-FUNCTION: list[str] = '''
+FUNCTION = '''
     def f(a,
           b=2):
         """What it does."""
@@ -20,7 +20,8 @@ FUNCTION: list[str] = '''
         for x in range(a):
             b += x
         return b
-'''.strip("\n").splitlines()
+'''
+LINES: list[str] = [str(line) for line in FUNCTION.strip("\n").splitlines()]
 
 
 @pytest.mark.parametrize(
@@ -36,8 +37,8 @@ FUNCTION: list[str] = '''
     ],
 )
 def test_a_change_is_run_where_its_statement_is_and_a_compound_one_where_its_head_is(line, first, last):
-    (place,) = [number for number, text in enumerate(FUNCTION) if line in text]
-    found = [FUNCTION[number] for number in statement(FUNCTION, place)]
+    (place,) = [number for number, text in enumerate(LINES) if line in text]
+    found = [LINES[number] for number in statement(LINES, place)]
     assert first in found[0]
     assert last in found[-1]
 

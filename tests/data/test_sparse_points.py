@@ -59,7 +59,7 @@ RGB = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     [
         (HEADER.format(0, XYZ + RGB), "it holds no points"),
         (HEADER.format(2, XYZ + RGB) + "a b c d e f\n1 2 3 4 5 6\n", "could not convert string to float"),
-        (HEADER.format(2, XYZ + RGB) + "1 2 nan 4 5 6\n1 2 3 4 5 6\n", "1 of its 2 points are not finite"),
+        (HEADER.format(2, XYZ + RGB) + "1 2 nan 4 5 6\n1 inf 3 4 5 6\n", "none of its 2 points is finite"),
         (HEADER.format(10**30, XYZ + RGB) + "1 2 3 4 5 6\n", "it holds 1 of the 1000000000000000000000000000000"),
         (HEADER.format(1, XYZ) + "0 0 0\n", "have no blue, green, red"),
         (HEADER.format(2, XYZ + RGB) + "0 0 0 1 2 3\n", "1 of the 2 points"),
@@ -85,11 +85,14 @@ def test_points_that_do_not_exist_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_points_nowhere_are_refused(value, tmp_path):
+def test_points_are_refused_where_all_of_them_are_nowhere(value, tmp_path):
     positions = np.zeros((3, 3))
-    positions[1, 2] = value
+    positions[:2, 2] = value
     write_points(tmp_path / "points.ply", positions, np.zeros((3, 3), np.uint8))
-    with pytest.raises(InputError, match="1 of its 3 points are not finite"):
+    check_points(tmp_path / "points.ply")
+    positions[2, 0] = value
+    write_points(tmp_path / "points.ply", positions, np.zeros((3, 3), np.uint8))
+    with pytest.raises(InputError, match="none of its 3 points is finite"):
         check_points(tmp_path / "points.ply")
 
 

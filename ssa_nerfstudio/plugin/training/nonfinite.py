@@ -190,6 +190,8 @@ def finite_points(points: tuple[Tensor, Tensor] | None) -> tuple[Tensor, Tensor]
     if not finite.any():
         _LOG.warning("the dataset has no usable 3D points; starting from random ones")
         return None
+    if missing := len(finite) - int(finite.sum()):
+        _LOG.warning(f"{missing} of the dataset's {len(finite)} 3D points are not finite; they are left out")
     return points[0][finite], points[1][finite] if len(points[1]) else points[1]
 
 

@@ -629,7 +629,10 @@ def test_seed_points_that_are_not_finite_are_left_out_with_their_colors(caplog):
     bare = finite_points((points, colors[:0]))
     assert bare is not None
     assert (bare[0].shape, bare[1].shape) == ((2, 3), (0, 3))
+    assert caplog.text.count("2 of the dataset's 4 3D points are not finite; they are left out") == 2
+    caplog.clear()
     assert finite_points(None) is None
+    assert finite_points((points[[0, 3]], colors[[0, 3]])) is not None
     assert not caplog.text
     assert finite_points((points[1:3], colors[1:3])) is None
     assert "no usable 3D points; starting from random ones" in caplog.text
