@@ -8,10 +8,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
+from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, LayerEstimate
 
-MIN_OPACITY = 0.1
-"""Estimated opacities below this are noise."""
 USUAL = 0.99
 """Quantile of the clear pixels: where a larger share of the samples is unexplained than there, it is unusual."""
 MIN_MEAN_OPACITY = 0.5

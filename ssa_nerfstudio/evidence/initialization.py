@@ -11,10 +11,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.changing_area import MIN_OPACITY, changing_area
+from ssa_nerfstudio.evidence.changing_area import changing_area
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
-from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
 from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL
 from ssa_nerfstudio.evidence.statistics import ImageStatistics

@@ -33,6 +33,8 @@ MIN_BRIGHTEST = 0.3
 """Below this the clearest part of the frame is not clear but hidden, as behind binoculars, and is not rescaled."""
 DETAIL_RADIUS = 4
 """Working pixels: differences from means over windows of this radius are details, and not the scene's."""
+MIN_OPACITY = 0.1
+"""Opacities below this are noise."""
 CERTAIN_OPACITY = 0.3
 """Opacities above this are rarely noise: at most 1.2 % of the frame of three clean captures."""
 MIN_SHARE = 0.02

@@ -20,13 +20,7 @@ from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
-from ssa_nerfstudio.evidence.initialization import (
-    estimate,
-    guide_of,
-    ignore_changing,
-    initialize,
-    initialize_from,
-)
+from ssa_nerfstudio.evidence.initialization import estimate, guide_of, ignore_changing, initialize, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
