@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError, TrainingError
 
@@ -95,11 +96,11 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         for folder in command.merge:
             if not (folder / "results").is_dir():
                 raise InputError(f"--merge {folder} holds no results", "name the --output folder of another ssa bench")
-            console.print(f"{merge(folder, command.output)} results taken over from {folder}")
+            console.print(f"{counted(merge(folder, command.output), 'result')} taken over from {folder}")
         store_plan(command.output, name, benchmark, planned)
         if command.prepare_only:
             prepare(runs, place.scenes, place.artifacts, command.threads)
-            console.print(f"{len({run.dataset for run in runs})} datasets are ready in {place.scenes}")
+            console.print(f"{counted(len({run.dataset for run in runs}), 'dataset')} ready in {place.scenes}")
             return [], []
         options = bench.Options(
             command.threads,
@@ -111,7 +112,9 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         )
         left = bench.bench(runs, place, f"ssa {name} {command.benchmark}", options, console)
     if left:
-        console.print(f"{len(left)} of {len(runs)} runs are left; call the same again to go on. First: {left[0].id}")
+        console.print(
+            f"Left: {len(left)} of {counted(len(runs), 'run')}; call the same again to go on. First: {left[0].id}"
+        )
     results = {result.run.id: result for result in read_all([command.output])[0]}
     ended = [results.get(run.id) or Result(run, "failed", "it left no result") for run in runs if run not in left]
     return left, [result for result in ended if result.status == "failed"]
@@ -125,6 +128,6 @@ def require_none(failed: list[Result]) -> None:
     """
     if failed:
         raise TrainingError(
-            f"{len(failed)} runs failed, first {failed[0].run.id}: {failed[0].reason}",
+            f"{counted(len(failed), 'run')} failed, first {failed[0].run.id}: {failed[0].reason}",
             "see its log; call the same again to repeat them",
         )

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
@@ -74,8 +75,8 @@ class Command:
             export.write_poses(folder, photos)
         left = sum(photo.left for photo in photos) / len(photos)
         console.print(
-            f"{self.output}: {len(photos)} photos for {export.preset.title}, {export.frame} frame; {left:.1%} of their "
-            f"pixels are left, of the least {min(photo.left for photo in photos):.1%}"
+            f"{self.output}: {counted(len(photos), 'photo')} for {export.preset.title}, {export.frame} frame; "
+            f"{left:.1%} of their pixels are left, of the least {min(photo.left for photo in photos):.1%}"
         )
         console.print(f"There: {export.preset.start}")
 

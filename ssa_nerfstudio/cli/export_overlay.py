@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
@@ -92,7 +93,7 @@ class Command:
             recovered = [photo for photo in written_photos if photo.shows]
             if photos and not recovered:
                 raise InputError(
-                    f"none of the {len(photos)} photos in {self.apply} shows the artifact where it was learned",
+                    f"none of the photos in {self.apply} shows the artifact where it was learned",
                     "choose photos of the camera that the run was trained on, before anything was removed from them",
                 )
         for camera in written["cameras"]:
@@ -105,15 +106,15 @@ class Command:
             hidden = sum(r.hidden for r in recovered) / len(recovered)
             implausible = max(recovered, key=lambda r: r.implausible)
             console.print(
-                f"{self.output / 'photos'}: {len(recovered)} photos; {hidden:.1%} of their pixels lie behind a matte "
-                f"above {self.threshold:g} or at its edge and could not be recovered (black). Where the artifact is "
-                f"estimated wrongly, pixels leave the range of colors: at most {implausible.implausible:.1%} of a "
-                f"photo ({implausible.path})."
+                f"{self.output / 'photos'}: {counted(len(recovered), 'photo')}; {hidden:.1%} of their pixels lie "
+                f"behind a matte above {self.threshold:g} or at its edge and could not be recovered (black). Where "
+                f"the artifact is estimated wrongly, pixels leave the range of colors: at most "
+                f"{implausible.implausible:.1%} of a photo ({implausible.path})."
             )
             if unchanged := [str(photo.path) for photo in written_photos if not photo.shows]:
                 console.print(
-                    f"{len(unchanged)} more photos do not show the artifact where it was learned, and were written as "
-                    f"they are: {', '.join(unchanged[:3])}{', ...' if len(unchanged) > 3 else ''}."
+                    f"{counted(len(unchanged), 'photo')} left unchanged, without the artifact where it was learned: "
+                    f"{', '.join(unchanged[:3])}{', ...' if len(unchanged) > 3 else ''}."
                 )
             if clipped := sum(r.clipped for r in recovered) / len(recovered):
                 console.print(

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.cameras.projections import FaceName, Projection
@@ -145,7 +146,9 @@ class Command:
             if source.faces:
                 console.print(cut_into_faces(source))
             if source.skipped_videos:
-                console.print(f"{source.path}: {len(source.skipped_videos)} videos beside the photos are left out")
+                console.print(
+                    f"{source.path}: left out beside the photos: {counted(len(source.skipped_videos), 'video')}"
+                )
         with progress_display(console) as on_progress:
             summary = process(on_progress=on_progress)
 

@@ -8,6 +8,7 @@ import shlex
 from dataclasses import dataclass
 from pathlib import Path
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
@@ -73,6 +74,8 @@ class Command:
 
         train, _, test = dataset.split
         console = plain_console()
-        console.print(f"{self.output}: {len(train)} training photos, {len(test)} clean test photos")
+        console.print(
+            f"{self.output}: {counted(len(train), 'training photo')}, {counted(len(test), 'clean test photo')}"
+        )
         data, out = (shlex.quote(str(path)) for path in (self.output, self.output.with_name(f"{self.output.name}-run")))
         console.print(f"Make splats of it: ssa run {data} --output {out}")

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.natural_order import natural_order
 from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.photos import UPRIGHT, exif_orientation, open_photo
@@ -157,9 +158,7 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
     if not photos:
         return _videos(path, name, videos)
     if len(photos) < min_photos:
-        raise InputError(
-            f"{path} holds {len(photos)} photo{'s'[: len(photos) > 1]}, {min_photos} are needed", "add more"
-        )
+        raise InputError(f"{path} holds {counted(len(photos), 'photo')}, {min_photos} are needed", "add more")
     groups = _by_frame(photos)
     (size, orientation), *others = groups
     for other in others:
@@ -172,7 +171,7 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
             )
         raise InputError(
             f"{photo} is {other[0][0]} x {other[0][1]}, {photos[0].name} is {size[0]} x {size[1]}",
-            f"use one folder for each camera and orientation, or remove the {len(groups[other])} photos like it",
+            f"use one folder for each camera and orientation, or remove {counted(len(groups[other]), 'photo')} like it",
         )
     return _of_photos(name, path, photos, (size, orientation), videos)
 

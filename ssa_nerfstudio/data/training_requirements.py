@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.lens import undistorted_lens
 from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import FILE_KEYS, OTHER_MODELS, SPLITS, Split, Transforms, is_file
@@ -36,7 +37,9 @@ def check_training(
     """
     path, count = transforms.path, len(transforms.frames)
     if count < MIN_VIEWS:
-        raise InputError(f"{path} lists {count} photos; at least {MIN_VIEWS} are needed, 30 and more work well")
+        raise InputError(
+            f"{path} lists {counted(count, 'photo')}; at least {MIN_VIEWS} are needed, 30 and more work well"
+        )
     if downscale_factor is not None and downscale_factor < 1:
         raise InputError(f"the downscale factor must be at least 1, got {downscale_factor}", "2 reads images_2")
     _check_poses(transforms)
@@ -86,7 +89,7 @@ def _check_split(transforms: Transforms, needed: Iterable[Split]) -> None:
             )
     if len(stated["train"] or ()) < MIN_VIEWS:
         raise InputError(
-            f"{transforms.path}: train_filenames leaves {len(stated['train'] or ())} photos to train on",
+            f"{transforms.path}: train_filenames leaves {counted(len(stated['train'] or ()), 'photo')} to train on",
             f"list at least {MIN_VIEWS}",
         )
 
@@ -164,7 +167,7 @@ def _check_files(transforms: Transforms, downscale_factor: int | None) -> None:
         names = [frame[key] for frame in transforms.frames if key in frame]
         if 0 < len(names) < len(transforms.frames):
             raise InputError(
-                f"{transforms.path}: {len(names)} of {len(transforms.frames)} frames have a {key}",
+                f"{transforms.path}: {key} is stated in {len(names)} of {len(transforms.frames)} frames",
                 "state it in all frames or in none",
             )
         if kind == "depths":

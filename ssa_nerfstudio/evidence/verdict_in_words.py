@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, Interval
 
 _KINDS = {"faint": "semi-transparent", "opaque": "opaque, at least in part"}
@@ -9,9 +10,9 @@ _KINDS = {"faint": "semi-transparent", "opaque": "opaque, at least in part"}
 
 def verdict_in_words(detection: Detection) -> str:
     """One sentence without a period: what was found, how much of the frame it covers, and how sure that is."""
-    photos = f"{detection.views} photos"
+    photos = counted(detection.views, "photo")
     if detection.views < MIN_VIEWS:
-        return f"{photos} are too few to tell whether they have a static artifact; {MIN_VIEWS} are needed"
+        return f"too few photos ({detection.views}) to tell whether they have a static artifact; {MIN_VIEWS} are needed"
     if detection.too_few_edges:
         return f"no static artifact in {photos}: some edges stand still, but too few to be one"
     if detection.verdict == "none":

@@ -11,6 +11,7 @@ import torch
 import yaml
 from torch import Tensor
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts, Overlay
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES
@@ -195,5 +196,7 @@ def load_overlay(config: Path | str, camera: int = 0, step: int | None = None) -
     """
     artifacts = Checkpoint.read(Path(config), step).artifacts()
     if not 0 <= camera < len(artifacts):
-        raise InputError(f"{config} has {len(artifacts)} overlays, not one of camera {camera}", "count from 0")
+        raise InputError(
+            f"{config} has {counted(len(artifacts), 'overlay')}, not one of camera {camera}", "count from 0"
+        )
     return artifacts[camera]

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from PIL import Image
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.lens import undistort, undistorted_lens
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.photos import read_gray
@@ -192,10 +193,11 @@ class DatasetExport:
         without = (
             ""
             if self.program == "nerfstudio" or not self._clean_views
-            else (f"\n{len(self._clean_views)} test photos of the dataset are left out.\n")
+            else f"\nLeft out: {counted(len(self._clean_views), 'test photo')} of the dataset.\n"
         )
         return (
-            f"# {len(photos)} photos for {self.preset.title}\n\n    {self.preset.start}\n\n{self.preset.note}\n\n"
+            f"# {counted(len(photos), 'photo')} for {self.preset.title}\n\n    {self.preset.start}\n\n"
+            f"{self.preset.note}\n\n"
             f"Here are {kind}, in the {self.frame} frame. {masked} White is used, black is ignored.\n{without}\n"
             f"Of the photos {np.mean(left):.1%} is left, of the least {min(left):.1%}.\n\n"
             f"| photo | left |\n|---|---|\n{rows}\n\nThe layout follows:\n\n{sources}\n"

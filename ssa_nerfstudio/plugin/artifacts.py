@@ -294,6 +294,6 @@ def _extra_state_in(state: dict[str, Any], prefix: str) -> dict[str, list[str]]:
     for name, values in extra.items():
         if len(values) != len(keys):
             raise InputError(
-                f"the checkpoint has {len(keys)} groups of photos and {len(values)} {name}", "take another"
+                f"the {name} in the checkpoint are not one for each of its groups of photos", "take another"
             )
     return extra

@@ -14,6 +14,7 @@ import torch
 from nerfstudio.cameras.cameras import Cameras
 from rich.progress import track
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order, interval_at
 from ssa_nerfstudio.cameras.panorama import Face
@@ -277,7 +278,7 @@ def _in_words(detection: Detection, share: float, name: str, known: str = "") ->
     reason = "too few to tell" if detection.views < MIN_VIEWS else "as many static edges as chance has"
     reason = "some edges stand still, but too few to be one" if detection.too_few_edges else reason
     text = (
-        f"{name} show no static artifact ({detection.views} views, {reason}): training without an overlay. "
+        f"{name} show no static artifact ({counted(detection.views, 'view')}, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"
     )
     return text, text

@@ -14,6 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import MachineConfig
 from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.training_requirements import MIN_VIEWS
 from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
@@ -144,7 +145,7 @@ def check_views(outputs: DataparserOutputs, source: Path) -> None:
     views = len(outputs.image_filenames)
     if views < MIN_VIEWS:
         raise InputError(
-            f"{source} leaves {views} photos to train on",
+            f"{source} leaves {counted(views, 'photo')} to train on",
             f"at least {MIN_VIEWS} are needed: add photos, or hold fewer back for evaluation",
         )
     cameras = outputs.cameras

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.data.photos import UPRIGHT
 from ssa_nerfstudio.data.sources import Source
@@ -83,11 +84,11 @@ def read_existing_model(path: Path, photos: Path, sources: Sequence[Source]) -> 
     if len(present) < 2:
         example = min(image.name for image in names.values())
         raise InputError(
-            f"{len(present)} of the {len(names)} photos with a pose in {path} are in {photos} (one is {example})",
+            f"{photos} has {len(present)} of {counted(len(names), 'photo')} with a pose in {path} (one is {example})",
             "give the folder that COLMAP had as --image_path",
         )
     if left := len(names) - len(present):
-        _LOG.warning(f"{left} photos of {path} are not in {photos}: they are left out")
+        _LOG.warning(f"{counted(left, 'photo')} of {path} left out: not in {photos}")
     cameras = [camera for source in sources for camera in _by_camera(source, present, model)]
     known = {file: _known(image, path) for file, image in present.items()}
     return ExistingModel(path, tuple(source for source, _ in cameras), tuple(lens for _, lens in cameras), known)

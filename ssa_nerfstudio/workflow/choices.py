@@ -10,6 +10,7 @@ from typing import Any
 
 import torch
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.sfm.ingest import MAX_TRAINING_SIZE
@@ -128,8 +129,7 @@ def choose_length_and_scale(longest: int, steps: int | None) -> tuple[int, float
     scale = min(1.0, CPU_SIZE / trained)
     if scale == 1 and steps is not None:
         return steps, scale, ()
-    text = (
-        f"trained without a GPU, for {steps or CPU_STEPS:,} steps on photos of at most {round(scale * trained)} pixels"
-    )
+    text = f"trained without a GPU, for {counted(steps or CPU_STEPS, 'step')} on photos of at most "
+    text += f"{round(scale * trained)} pixels"
     text += f"; with one, the same command trains {STEPS:,} steps on all pixels, which is sharper"
     return steps or CPU_STEPS, scale, (text,)

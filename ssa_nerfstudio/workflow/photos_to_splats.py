@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio.cameras.intervals import BEGINNING
 from ssa_nerfstudio.data.panorama_entry import read_panorama
@@ -170,7 +171,8 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     text = decided.get(overlays, f"the artifacts of {overlays} {kind} were learned with the scene")
     resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
     return Result(
-        f"{text}, in {checkpoint.step + 1:,} steps{resumed}", (*plan.training_warnings, *clear_overlays(layers))
+        f"{text}, in {counted(checkpoint.step + 1, 'step')}{resumed}",
+        (*plan.training_warnings, *clear_overlays(layers)),
     )
 
 

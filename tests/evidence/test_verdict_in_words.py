@@ -29,7 +29,7 @@ PARTS = (Interval(0, 10, "none", 0.0), Interval(10, 25, "faint", 0.031))
     [
         (
             replace(NONE, views=5, p_value=1.0),
-            "5 photos are too few to tell whether they have a static artifact; 6 are needed",
+            "too few photos (5) to tell whether they have a static artifact; 6 are needed",
         ),
         (replace(NONE, views=6), "no static artifact in 6 photos"),
         (NONE, "no static artifact in 25 photos"),

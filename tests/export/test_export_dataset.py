@@ -263,7 +263,7 @@ def test_a_mask_of_the_dataset_is_kept_and_clean_test_photos_are_not_masked(rig,
     assert written["test_filenames"] == names[:2]
     other = export(data, tmp_path / "other", "colmap")
     assert len(pycolmap.Reconstruction(other / "sparse/0").images) == 2 * VIEWS - 2
-    assert "2 test photos of the dataset are left out" in (other / "README.md").read_text()
+    assert "Left out: 2 test photos of the dataset." in (other / "README.md").read_text()
 
 
 def test_without_a_training_the_detected_artifact_is_masked(tiny_scene, tmp_path, draw_effect):

@@ -60,12 +60,12 @@ def test_a_dataset_without_photos_is_refused(broken_scene, tmp_path, train):
 
 def test_a_single_photo_is_refused(broken_scene, tmp_path, train):
     edit_frames(broken_scene, lambda frames: frames[:1])
-    assert "lists 1 photos; at least 2" in refusal(lambda: train(broken_scene, tmp_path / "out"))
+    assert "lists 1 photo; at least 2" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
 def test_a_split_that_leaves_one_photo_to_train_on_is_refused(broken_scene, tmp_path, train):
     edit_frames(broken_scene, lambda frames: frames[:2])
-    assert "leaves 1 photos to train on" in refusal(lambda: train(broken_scene, tmp_path / "out"))
+    assert "leaves 1 photo to train on" in refusal(lambda: train(broken_scene, tmp_path / "out"))
 
 
 def test_a_missing_photo_is_named(broken_scene, tmp_path, train):

@@ -114,7 +114,7 @@ def test_cameras_of_the_model(cameras, tmp_path, behind_dashboard):
         (lambda model: (model / "points3D.bin").write_bytes(b"?" * 3000), "cannot be read"),
         (lambda model: (model / "points3D.bin").write_bytes(np.random.default_rng(0).bytes(900)), "cannot be read"),
         (lambda model: (model / "images.bin").write_bytes((model / "images.bin").read_bytes()[:99]), "cannot be read"),
-        (lambda model: model_of({0: np.eye(4)}, name="other/{}.jpg").write_binary(model), "0 of the 1 photos with a"),
+        (lambda model: model_of({0: np.eye(4)}, name="other/{}.jpg").write_binary(model), "0 of 1 photo with a pose"),
         (lambda model: model_of({n: np.full((4, 4), np.nan) for n in range(4)}).write_binary(model), "is not finite"),
         (lambda model: resized(model), "photo_0.png is 224 x 168, its camera in the model has 112 x 84"),
         (lambda model: fisheye(model), "the model has a THIN_PRISM_FISHEYE camera"),

@@ -143,7 +143,7 @@ def absence(results: list[Result], planned: set[str]) -> str:
         return "what was planned is not noted beside the results, so that missing ones are not known"
     missing = planned - {result.run.id for result in results}
     named = f": {', '.join(f'`{run}`' for run in sorted(missing))}" if missing else ""
-    return f"{len(missing)} of {len(planned)} planned ones are missing{named}"
+    return f"missing are {len(missing)} of {len(planned)} that were planned{named}"
 
 
 def merge(source: Path, target: Path) -> int:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import TrainingError
 
 CHECK_EVERY = 100
@@ -125,7 +126,7 @@ class NonFiniteGuard:
                     f"on, were skipped because {culprits} not finite",
                     "resume from an earlier checkpoint (--load-dir) with lower learning rates",
                 )
-        _LOG.warning(f"{sum(skips)} of the {len(skips)} steps up to {step} were skipped: {culprits} not finite")
+        _LOG.warning(f"skipped {sum(skips)} of {counted(len(skips), 'step')} up to {step}: {culprits} not finite")
         return sum(skips)
 
     def _culprits(self, last_was_skipped: bool) -> str:

@@ -74,7 +74,7 @@ def test_no_run_is_started_that_would_not_end_in_time(tmp_path, capsys):
     for run in runs:
         (tmp_path / "scenes" / run.dataset).mkdir(exist_ok=True)
     main(["bench", "smoke", "--output", str(tmp_path), "--time-limit", "10"])
-    assert "4 of 5 runs are left; call the same again to go on" in capsys.readouterr().out
+    assert "Left: 4 of 5 runs; call the same again to go on" in capsys.readouterr().out
     assert not (tmp_path / "logs").exists()
 
 
@@ -82,7 +82,7 @@ def test_what_runs_at_the_time_limit_is_stopped_and_leaves_nothing(tmp_path):
     started = time.monotonic()
     done = ssa("bench", "smoke", "--output", tmp_path, "--only", "*-none-3dgs-*", "--time-limit", "0.05")
     assert done.returncode == 0, done.stderr
-    assert "1 of 1 runs are left" in done.stdout
+    assert "Left: 1 of 1 run;" in done.stdout
     assert time.monotonic() - started < 120
     assert read_all([tmp_path]) == ([], [])
     assert at_work(tmp_path) == []
@@ -136,14 +136,14 @@ def test_what_a_training_leaves_undone_is_left_under_each_of_its_names(tmp_path,
     path = tmp_path / "twice.yaml"
     path.write_text("scenes: [{data: demo}]\nparts: [{methods: [paper, l1-0.05], effects: [dashboard], steps: 5}]")
     main(["bench", str(path), "--output", str(tmp_path / "out"), "--time-limit", "0.001"])
-    assert "2 of 2 runs are left" in capsys.readouterr().out
+    assert "Left: 2 of 2 runs;" in capsys.readouterr().out
 
 
 def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monkeypatch, capsys):
     path = tmp_path / "rain.yaml"
     path.write_text("scenes: [{data: demo}]\nparts: [{methods: [3dgs], effects: [rain]}]")
     main(["bench", str(path), "--output", str(tmp_path / "there"), "--prepare-only"])
-    assert "1 datasets are ready" in capsys.readouterr().out
+    assert "1 dataset ready" in capsys.readouterr().out
     (tmp_path / "here").mkdir()
     (tmp_path / "there" / "artifacts").rename(tmp_path / "here" / "artifacts")
     monkeypatch.setitem(sys.modules, "albumentations", None)  # as on a machine without it
@@ -297,7 +297,7 @@ def test_a_run_that_fails_says_why_and_fails_the_command(tmp_path, capsys):
         main(["bench", str(path), "--output", str(tmp_path / "out")])
     assert failure.value.code == 3
     said = capsys.readouterr()
-    assert f"1 runs failed, first {run.id}: InputError: --pipeline.model.sparsity-weight must be at least 0" in said.err
+    assert f"1 run failed, first {run.id}: InputError: --pipeline.model.sparsity-weight must be at least 0" in said.err
     assert "call the same again to repeat them" in said.err
     assert "are done" not in said.out
     (failed,), _ = read_all([tmp_path / "out"])

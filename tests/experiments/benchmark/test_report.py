@@ -247,7 +247,7 @@ def test_what_is_missing_truncated_or_foreign_is_named_and_the_report_goes_on(tm
         0
     ]
     assert all(line in text for line in problems)
-    assert f"2 of {len(results)} planned ones are missing: " in text
+    assert f"missing are 2 of {len(results)} that were planned: " in text
     assert f"`{results[0].run.id}`" in text
 
 

@@ -130,9 +130,9 @@ def test_missing_runs_are_named(tmp_path):
     made = curves()
     analyze([folder_of(tmp_path, made[1:])], tmp_path / "out", IDS)
     text = (tmp_path / "out" / "tradeoff.md").read_text()
-    assert f"1 of 4 planned ones are missing: `{made[0].run.id}`." in text
+    assert f"missing are 1 of 4 that were planned: `{made[0].run.id}`." in text
     analyze([folder_of(tmp_path, made)], tmp_path / "out", IDS)
-    assert "0 of 4 planned ones are missing." in (tmp_path / "out" / "tradeoff.md").read_text()
+    assert "missing are 0 of 4 that were planned." in (tmp_path / "out" / "tradeoff.md").read_text()
 
 
 def test_kernels_are_compiled_by_short_runs_that_leave_nothing(tmp_path, monkeypatch):

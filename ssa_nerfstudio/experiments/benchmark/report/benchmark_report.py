@@ -8,6 +8,7 @@ from collections import Counter
 from itertools import product
 from pathlib import Path
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error, write_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report import category_tables, detail_tables, difference_tables
@@ -79,9 +80,9 @@ def _overview(results: list[Result], planned: set[str], problems: list[str], fol
     results = [result for result in results if not result.run.marks]
     counts = Counter(result.status for result in results)
     text = [
-        f"Made by `ssa report {' '.join(shlex.quote(str(folder)) for folder in folders)}` from {len(results)} runs: "
-        f"{counts['finished']} finished, {counts['diverged']} diverged (†, left out of means), {counts['failed']} "
-        f"failed; {absence(results, planned)}. Every run's JSON holds its command.",
+        f"Made by `ssa report {' '.join(shlex.quote(str(folder)) for folder in folders)}` from "
+        f"{counted(len(results), 'run')}: {counts['finished']} finished, {counts['diverged']} diverged (†, left out of "
+        f"means), {counts['failed']} failed; {absence(results, planned)}. Every run's JSON holds its command.",
         "PSNR, SSIM (valid padding), FLIP and mean color deviation (0 to 255) compare the clean render with "
         "clean test views that no training saw.",
     ]

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.experiments.benchmark.results import Result
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN, METHODS, category
 
@@ -47,7 +48,7 @@ class Study:
         """For headings."""
         other = f", other artifacts (effect seed {self.effect_seed})" if self.effect_seed else ""
         marred = "" if self.clean_tests else ", test photos with the artifact"
-        return f"{self.steps:,} steps{other}{marred}"
+        return f"{counted(self.steps, 'step')}{other}{marred}"
 
     @property
     def real(self) -> bool:

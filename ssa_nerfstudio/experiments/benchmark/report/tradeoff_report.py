@@ -6,6 +6,7 @@ import csv
 import shlex
 from pathlib import Path
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
@@ -53,10 +54,11 @@ def analyze(folders: list[Path], output: Path, planned: set[str]) -> tuple[list[
     about = Section(
         "How to read this",
         [
-            f"Made by `ssa tradeoff NAME --report-only --output {source}` from {len(along)} runs, {len(shared)} of "
-            f"which shared their device: those are drawn, but on no frontier; {absence(results, planned)}. Seconds "
-            "are the overlay's statistics and training; decoding photos and evaluations along the way are not counted. "
-            "Quality is that of the clean render on clean test views at full resolution.",
+            f"Made by `ssa tradeoff NAME --report-only --output {source}` from "
+            f"{counted(len(along), 'run')}, {len(shared)} of which shared their device: those are drawn, "
+            f"but on no frontier; {absence(results, planned)}. Seconds are the overlay's statistics and training; "
+            "decoding photos and evaluations along the way are not counted. Quality is that of the clean "
+            "render on clean test views at full resolution.",
             "A point on the frontier is beaten by no other in both time and PSNR. The knee is the point farthest above "
             "the line between the frontier's ends, over the logarithm of seconds. Learning rates fall over the whole "
             "length of a run: a point early in a long run is worse than the end of a short one.",
