@@ -64,7 +64,8 @@ def check_points(path: Path) -> None:
             if not np.isfinite(points).all(axis=1).any():  # a training leaves single ones out
                 raise ValueError(f"none of its {count} points is finite")
     except (OSError, ValueError) as error:
-        raise InputError(f"{path} cannot be read as sparse points ({error})", _REMEDY) from error
+        reason = (isinstance(error, OSError) and error.strerror) or error
+        raise InputError(f"{path} cannot be read as sparse points ({reason})", _REMEDY) from error
 
 
 def _coordinates(file: BinaryIO, kind: str, count: int, properties: dict[str, str]) -> np.ndarray:

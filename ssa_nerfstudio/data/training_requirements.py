@@ -42,8 +42,7 @@ def check_training(
         )
     if downscale_factor is not None and downscale_factor < 1:
         raise InputError(f"the downscale factor must be at least 1, got {downscale_factor}", "2 reads images_2")
-    _check_poses(transforms)
-    _check_alignment(transforms)
+    check_poses(transforms)
     _check_lenses(transforms)
     _check_files(transforms, downscale_factor)
     _check_split(transforms, splits)
@@ -94,7 +93,12 @@ def _check_split(transforms: Transforms, needed: Iterable[Split]) -> None:
         )
 
 
-def _check_poses(transforms: Transforms) -> None:
+def check_poses(transforms: Transforms) -> None:
+    """Check that all frames have poses, and what moves these into nerfstudio's world.
+
+    Raises:
+        InputError: a pose is missing or none, all cameras are in one place, or an entry that moves them is broken.
+    """
     positions = []
     for frame in transforms.frames:
         pose = _finite(frame.get("transform_matrix"))
@@ -118,6 +122,7 @@ def _check_poses(transforms: Transforms) -> None:
             f"{transforms.path}: all cameras are in one place, from which no depth can be seen",
             "move the camera between photos, or register them again",
         )
+    _check_alignment(transforms)
 
 
 def _check_alignment(transforms: Transforms) -> None:

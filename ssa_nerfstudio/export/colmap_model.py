@@ -11,6 +11,7 @@ import numpy as np
 
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.cameras.lens import Lens
+from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
 
@@ -43,7 +44,7 @@ def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[st
         The number of points.
 
     Raises:
-        InputError: the points cannot be read.
+        InputError: the points cannot be read, or a photo's name is no text.
     """
     pycolmap = import_pycolmap()
     applied = np.eye(4)
@@ -62,13 +63,9 @@ def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[st
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world_to_camera[:3]))
     count = 0
     if points is not None:
-        if not points.is_file():
-            raise InputError(f"{points}, the sparse points, does not exist", "process the photos again")
+        check_points(points)  # COLMAP's reader takes what is cut off for points
         cloud = pycolmap.Reconstruction()
-        try:
-            cloud.import_PLY(points)
-        except (ValueError, RuntimeError, IndexError) as error:
-            raise InputError(f"{points} cannot be read as points ({error})", "process the photos again") from error
+        cloud.import_PLY(points)
         for point in cloud.points3D.values():
             model.add_point3D(to_colmap[:3, :3] @ point.xyz + to_colmap[:3, 3], pycolmap.Track(), point.color)
         count = len(cloud.points3D)

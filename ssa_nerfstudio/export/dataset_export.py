@@ -15,7 +15,9 @@ from PIL import Image
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.lens import undistort, undistorted_lens
 from ssa_nerfstudio.data.dataset import Dataset, View
-from ssa_nerfstudio.data.photos import read_gray
+from ssa_nerfstudio.data.photos import check_mask, read_gray
+from ssa_nerfstudio.data.training_requirements import check_poses, check_seed_points
+from ssa_nerfstudio.data.transforms import OTHER_MODELS
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.capture_artifact import CaptureArtifact, Frame
 from ssa_nerfstudio.export.colmap_model import PosedPhoto, write_colmap_model
@@ -59,8 +61,15 @@ class DatasetExport:
             frame: of photos and masks; auto: the program's own.
 
         Raises:
-            InputError: the program cannot read photos in that frame.
+            InputError: the program cannot read photos in that frame or of that camera, or poses or points are broken.
         """
+        if dataset.transforms.camera_model in OTHER_MODELS:
+            raise InputError(
+                f"{dataset.transforms.path}: camera_model {dataset.transforms.camera_model} cannot be exported",
+                "cut perspective photos out of these",
+            )
+        check_poses(dataset.transforms)
+        check_seed_points(dataset.transforms)
         self._dataset, self._artifact, self.program, self._photos = dataset, artifact, program, photos
         self.preset: Preset = PRESETS[program]
         self.frame: Frame = self.preset.frame if frame == "auto" else frame
@@ -74,7 +83,10 @@ class DatasetExport:
             dataset.views if program == "nerfstudio" else [v for v in dataset.views if v.path not in self._clean_views]
         )
         self.views = [view for view in wanted if view.role != "unused"]
-        self._poses = {frame["file_path"]: np.array(frame["transform_matrix"]) for frame in dataset.transforms.frames}
+        self._poses = {
+            frame["file_path"]: np.array(frame["transform_matrix"], dtype=np.float64)
+            for frame in dataset.transforms.frames
+        }
 
     def write_photos(self, folder: Path) -> Iterator[ExportedPhoto]:
         """Write photos and masks, one after the other.
@@ -144,7 +156,9 @@ class DatasetExport:
             mask &= ~holes
         for kind, name in view.companions:
             if kind == "masks":
-                given = read_gray(self._dataset.source(name, "masks"))
+                file = self._dataset.source(name, "masks")
+                check_mask(file, (view.lens.width, view.lens.height))
+                given = read_gray(file)
                 given = undistort(given.astype(np.float32), view.lens) if warped else given
                 mask &= given > 0
         return photo, mask

@@ -134,8 +134,7 @@ def _by_camera(
     certain = [(number, camera) for number, camera in found if camera in own]
     for number, file in enumerate(source.photos):
         _, camera = min(certain, key=lambda each: abs(each[0] - number))
-        exact = present[file].camera_id if file in present else camera
-        members[exact if exact in own else camera].append(file)
+        members[camera].append(file)
     divided = []
     for camera, files in members.items():
         folder = "" if source.name == "frame" else f"{source.name}_"

@@ -47,6 +47,7 @@ def readers(tmp_path, configure_training):
             "simulate", "--data", data, "--output", out, "--effects", "vignette", "--threads", 1
         ),
         "train": train,
+        "export": lambda data: called("export-dataset", "--data", data, "--output", out, "--for", "colmap"),
     }
 
 
@@ -55,7 +56,7 @@ def contents(folder: Path) -> dict[str, str]:
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
 
 
-READERS = ("detect", "simulate", "train")
+READERS = ("detect", "simulate", "train", "export")
 
 
 @pytest.mark.parametrize("reader", READERS)
@@ -162,7 +163,7 @@ def judge(case, reader, code, err, tmp_path):
     if refused:
         assert code == 2, "was taken"
         assert len(lines) == 1, err
-        assert case["says"] in lines[0]
+        assert case.get(f"says to {reader}", case["says"]) in lines[0]
         assert not (tmp_path / "out").exists()
     else:
         assert (code, lines) == (0, [])

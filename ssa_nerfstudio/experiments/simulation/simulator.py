@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.data.training_requirements import check_seed_points
 from ssa_nerfstudio.data.writing import staged_folder
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.simulation.corruption import corrupt
@@ -40,6 +41,7 @@ def simulate(dataset: Dataset, scene: Scene, output: Path, threads: int, name: s
     renamed = {path: str(PurePosixPath(path).with_suffix(".png")) for path in corrupted}
     names = {view.path: view.path for view in dataset.views} | renamed
     _check_names(names)
+    check_seed_points(dataset.transforms)
     console = Console()
     # Without a terminal, a finished bar leaves an empty line.
     progress = Progress(console=console, transient=True, disable=not console.is_terminal)

@@ -10,7 +10,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-PLY = "ply\nformat ascii 1.0\nelement vertex 0\nend_header\n"
+_PROPERTIES = [
+    f"property {kind}" for kind in ("float x", "float y", "float z", "uchar red", "uchar green", "uchar blue")
+]
+PLY = "\n".join(["ply", "format ascii 1.0", "element vertex 1", *_PROPERTIES, "end_header", "0 0 1 9 9 9", ""])
 
 
 def write_dataset(

@@ -61,7 +61,8 @@ def truncate(path: Path) -> None:
         (lambda data: (data / "images/frame_003.jpg").unlink(), "frame_003.jpg does not exist; put the photo there"),
         (lambda data: (data / "images/frame_003.jpg").write_text("no"), "frame_003.jpg cannot be read as a photo"),
         (lambda data: truncate(data / "images/frame_003.jpg"), "frame_003.jpg cannot be read as a photo"),
-        (lambda data: (data / "sparse_pc.ply").unlink(), "sparse_pc.ply does not exist"),
+        (lambda data: (data / "sparse_pc.ply").unlink(), "sparse_pc.ply cannot be read as sparse points (No such"),
+        (lambda data: (data / "sparse_pc.ply").write_text(""), "remove ply_file_path from transforms.json"),
         (lambda data: edit(data, ply_file_path="../x.ply"), "../x.ply lies outside the dataset"),
         (lambda data: edit(data, train_filenames=[FIRST], test_filenames=[FIRST]), "both training and test view"),
         (

@@ -226,7 +226,7 @@ def test_a_file_that_cannot_be_copied_is_named_and_not_the_output(tmp_path, caps
     points.mkdir()
     with pytest.raises(SystemExit):
         run(data, tmp_path / "out", "--effects", "vignette")
-    assert f"{points} cannot be read (Is a directory)" in capsys.readouterr().err
+    assert f"{points} cannot be read as sparse points (Is a directory)" in capsys.readouterr().err
 
 
 def test_a_photo_too_large_to_be_one_is_named(tmp_path, capsys, monkeypatch):
