@@ -71,5 +71,4 @@ def widened(used: np.ndarray) -> np.ndarray:
     """Widen the masked part by 1 % of the longer side, so that descriptors do not extend into it."""
     margin = max(1, round(_MARGIN * max(used.shape)))
     element = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
-    # Outside the frame nothing is masked: erosion must not eat in from the border.
-    return cv2.erode(used.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=(1,)) > 0
+    return cv2.erode(used.astype(np.uint8), element) > 0  # whose default is that outside the frame nothing is masked

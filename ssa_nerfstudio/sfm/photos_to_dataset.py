@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
-from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
-from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.panorama import cut
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
@@ -34,13 +31,12 @@ from ssa_nerfstudio.sfm.registration import (
     check_registrations,
     is_complete,
     registrations,
+    warn_of_equal_cameras,
 )
 from ssa_nerfstudio.sfm.work_folder import resumable_work
 
 if TYPE_CHECKING:
     import pycolmap
-
-_LOG = logging.getLogger(__name__)
 
 SUMMARY = Path("colmap", "summary.json")
 """File of a dataset's `Summary`."""
@@ -179,7 +175,7 @@ def process(
         tests = {photo.name for each in photos[train:] for photo in each}
         used = [Path(each.mask) for each in passes if each.mask]
         write_dataset(dataset, files, tests, model, used, sources[0] if sources[0].faces else None)
-        _warn_of_equal_cameras(model, names[:train])
+        warn_of_equal_cameras(model, names[:train])
         repair = None
         if known is not None:
             kept = {*json.loads((motion / KEPT).read_text(encoding="utf-8"))}
@@ -206,18 +202,6 @@ def _poses(known: ExistingModel, photos: Sequence[Sequence[Photo]]) -> dict[str,
     files = [file for source in known.sources for file in source.photos]
     names = [photo.name for each in photos[: len(known.sources)] for photo in each]
     return {n: known.photos[file].pose for n, file in zip(names, files, strict=True) if file in known.photos}
-
-
-def _warn_of_equal_cameras(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:
-    """Training tells cameras apart by their frames and intrinsics alone."""
-    used = {image.camera_id for image in model.images.values() if image.has_pose}
-    lenses = {number: np.array([c.width, c.height, *c.params[:4]]) for number, c in model.cameras.items()}
-    for one, other in combinations(sorted(used & {*range(1, len(names) + 1)}), 2):
-        if (lenses[one][:2] == lenses[other][:2]).all() and same_intrinsics(lenses[one], lenses[other]):
-            _LOG.warning(
-                f"the cameras {names[one - 1]} and {names[other - 1]} have nearly the same intrinsics, and training "
-                "takes them for one with one overlay; where their artifacts differ, process and train them one by one"
-            )
 
 
 def _ingest_all(

@@ -5,8 +5,12 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
+from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.lens import Lens, undistorted_lens
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.ingest import Photo
@@ -119,6 +123,23 @@ def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
                 f"the lens that structure from motion estimates for the {names[number - 1]} photos would have pixels "
                 f"of {aspect(camera):.1f}:1 (focal lengths {fx:.0f} and {fy:.0f}): their poses are likely wrong; mask "
                 "what covers part of every frame, or take photos from more directions"
+            )
+
+
+def warn_of_equal_cameras(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:
+    """Warn of cameras that training, which tells them apart by their frames and intrinsics alone, takes for one.
+
+    Args:
+        model: the reconstruction.
+        names: of the passes to train on, whose cameras are numbered from 1.
+    """
+    used = {image.camera_id for image in model.images.values() if image.has_pose}
+    lenses = {number: np.array([c.width, c.height, *c.params[:4]]) for number, c in model.cameras.items()}
+    for one, other in combinations(sorted(used & {*range(1, len(names) + 1)}), 2):
+        if (lenses[one][:2] == lenses[other][:2]).all() and same_intrinsics(lenses[one], lenses[other]):
+            _LOG.warning(
+                f"the cameras {names[one - 1]} and {names[other - 1]} have nearly the same intrinsics, and training "
+                "takes them for one with one overlay; where their artifacts differ, process and train them one by one"
             )
 
 

@@ -27,13 +27,22 @@ def test_the_lens_and_all_poses_are_found_from_guesses(tmp_path, photos):
     structure.match(lambda *_: None)
     before = (tmp_path / "database.db").read_bytes()
 
+    held = set()
+
     def options() -> pycolmap.IncrementalPipelineOptions:
+        with pycolmap.Database.open(tmp_path / "held/database.db") as opened:
+            held.add(tuple(opened.read_camera(1).params))
         made = pycolmap.IncrementalPipelineOptions()
         made.num_threads, made.random_seed = 1, 0
         return made
 
     found = map_with_held_lens(tmp_path / "database.db", images, tmp_path / "held", options, [1], None, lambda: None)
     assert found is not None
+    # Guesses are lenses without distortion, whose axis is the middle, from 45 to 100 degrees across.
+    guesses = sorted(lens for lens in held if not any(lens[4:]))
+    assert all(lens == (lens[0], lens[0], WIDTH / 2, HEIGHT / 2, 0, 0, 0, 0) for lens in guesses)
+    angles = 2 * np.degrees(np.arctan(WIDTH / 2 / np.array([lens[0] for lens in guesses])))
+    np.testing.assert_allclose(angles, [100, 80, 61, 45], atol=1)
     views = [image for image in found.images.values() if image.has_pose]
     assert len(views) == VIEWS
     focal = WIDTH / 2 / np.tan(np.radians(65 / 2))

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ssa_nerfstudio.sfm.image_pairs import exhaustive_pairs, sequential_pairs
 
 
+@settings(deadline=None)
 @given(st.lists(st.integers(1, 300), min_size=1, max_size=2))
 def test_pairs_are_of_different_photos_each_once_and_connect_all(counts):
     passes = [[f"{number}_{photo}" for photo in range(count)] for number, count in enumerate(counts)]

@@ -24,7 +24,11 @@ def capture(tmp_path_factory, photos) -> Path:
 
 def processed(capture: Path, output: Path, hidden: np.ndarray) -> tuple[Summary, set[str]]:
     """What came of an opaque artifact where `hidden` is True, and the parts that progress was shown of."""
-    parts: set[str] = set()
+    shown: dict[str, list[float]] = {}
+
+    def show(part: str, done: int, total: int) -> None:
+        shown.setdefault(part, []).append(done / total)
+
     found = FoundArtifact.of("opaque", hidden, VIEWS)
     sources = read_sources(capture, "frame", min_photos=3)
     settings = SfmSettings(threads=1)
@@ -33,9 +37,11 @@ def processed(capture: Path, output: Path, hidden: np.ndarray) -> tuple[Summary,
         detect=True,
         settings=settings,
         found=[found],
-        on_progress=lambda part, done, total: parts.add(part),
+        on_progress=show,
     )
-    return summary, parts
+    assert shown.keys() <= {"photos", "detection", "artifact", "features", "matches", "poses"}
+    assert all(min(shares) >= 0 and max(shares) == shares[-1] == 1 for shares in shown.values())
+    return summary, {*shown}
 
 
 def test_what_is_known_is_masked_and_not_detected_again(capture, tmp_path):

@@ -7,7 +7,12 @@ import pycolmap
 import pytest
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.sfm.registration import PassRegistration, check_lenses, check_registrations
+from ssa_nerfstudio.sfm.registration import (
+    PassRegistration,
+    check_lenses,
+    check_registrations,
+    warn_of_equal_cameras,
+)
 
 
 def model(*lenses: list[float]) -> pycolmap.Reconstruction:
@@ -27,6 +32,23 @@ def test_a_lens_that_no_camera_has_is_refused_by_its_name():
     check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [0.1, 0, 0.001, 0]))
     with pytest.raises(InputError, match=r"for the side photos is none \(k1 = 2, k2 = -0.21\)"):
         check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [6231.8, 247.9, 2.0042, -0.2101, -0.5735, 0.4871]))
+
+
+def test_pixels_that_no_camera_has_are_warned_of_by_its_name(caplog):
+    check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [800, 700, 0.1, 0, 0, 0]))
+    assert not caplog.records
+    check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [1000, 700, 0.1, 0, 0, 0]))
+    assert "for the side photos would have pixels of 1.4:1 (focal lengths 1000 and 700)" in caplog.text
+    caplog.clear()
+    check_lenses(["front", "side"], model([500, 700, 0.1, 0, 0, 0], [-0.2, 0.05, 0, 0]))
+    assert "for the front photos would have pixels of 1.4:1" in caplog.text
+
+
+def test_cameras_that_training_takes_for_one_are_named(caplog):
+    lenses = [[700, 700, 0, 0, 0, 0], [500, 500, 0, 0, 0, 0], [700.1, 700.1, 0.01, 0, 0, 0], [500, 500, 0, 0, 0, 0]]
+    warn_of_equal_cameras(model(*lenses), ["front", "side", "back"])  # the fourth has photos for tests
+    (record,) = caplog.records
+    assert "the cameras front and back have nearly the same intrinsics" in record.message
 
 
 @pytest.mark.parametrize(
