@@ -41,6 +41,8 @@ def refusal(error: BaseException) -> InputError | None:
     if _of_memory(error):
         about = f" ({text})" if (text := " ".join(str(error).split(". ")[0].split())) else ""
         return InputError(f"memory ran out{about:.200}", "close other programs, or use smaller photos")
+    if isinstance(error, RuntimeError) and str(error).startswith("Symlink loop"):  # pathlib's, before Python 3.13
+        return InputError(str(error), "name the folder itself")
     if not isinstance(error, OSError) or not error.strerror:
         return None
     name = os.fsdecode(error.filename) if isinstance(error.filename, (str, bytes)) else "the system refused a file"

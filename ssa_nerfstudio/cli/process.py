@@ -94,6 +94,8 @@ class Command:
             raise InputError(f"--min-registered is a share of the photos, from 0 to 1, got {self.min_registered}")
         if self.threads < 1 and self.threads != -1:
             raise InputError(f"--threads must be at least 1, or -1 for one a core, got {self.threads}")
+        if self.invert_mask and self.mask is None:
+            raise InputError("--invert-mask is for --mask", "give a mask, or leave it out")
         two = self.clean is not None
         sources = read_sources(self.train, "train" if two else "frame", min_photos=3)
         clean = None if self.clean is None else read_source(self.clean, "clean", min_photos=1)

@@ -15,6 +15,7 @@ from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.natural_order import natural_order
 from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.photos import UPRIGHT, exif_orientation, open_photo
+from ssa_nerfstudio.data.transforms import is_file
 from ssa_nerfstudio.data.video import Video
 from ssa_nerfstudio.errors import InputError
 
@@ -152,7 +153,7 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
         if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file():
             raise InputError(f"{path} is one photo", f"give the folder of all photos, {path.parent}")
         below = (file for file in islice(path.rglob("[!.]*"), _LOOKED_AT) if file.suffix.lower() in PHOTO_SUFFIXES)
-        first = next(below, None)
+        first = next((file for file in below if is_file(file)), None)
         remedy = "put them there or name another folder" if first is None else f"give {first.parent}, which does"
         raise InputError(f"{path} holds no photo and no video ({known})", remedy)
     if not photos:

@@ -54,13 +54,19 @@ class PhotoDataset(InputDataset):
         """Decode one photo and scale it by `scale_factor`: uint8 [H, W, 3], or [H, W, 4] for RGBA.
 
         Raises:
-            InputError: see `read_photo`.
+            InputError: less than a pixel is left, or see `read_photo`.
         """
         photo = read_photo(self.image_filenames[image_idx], self._stored_size(image_idx), alpha=True)
         if self.scale_factor == 1.0:
             return photo
         image = Image.fromarray(photo)
         size = int(image.width * self.scale_factor), int(image.height * self.scale_factor)
+        if min(size) < 1:
+            raise InputError(
+                f"--pipeline.datamanager.camera-res-scale-factor {self.scale_factor:g} leaves less than a pixel of "
+                f"{self.image_filenames[image_idx]}",
+                "choose a larger one",
+            )
         return np.array(image.resize(size, Image.Resampling.BILINEAR))
 
     def get_data(self, image_idx: int, image_type: Literal["uint8", "float32"] = "float32") -> dict:

@@ -31,6 +31,8 @@ def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np
         InputError: it cannot be read, is of another shape, or leaves less than 5 % of the frame.
     """
     try:
+        if path.is_fifo():
+            raise ValueError("it is a pipe")
         with Image.open(path) as image:
             gray = np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

@@ -106,6 +106,8 @@ class RunRecord:
             self._write()
             return
         try:
+            if path.is_fifo():
+                raise ValueError("it is a pipe")
             for name, entry in json.loads(path.read_text(encoding="utf-8")).items():
                 self._choices[name] = dict(entry["choices"])
                 decided = self._decisions[name] = list(entry.get("decisions", []))
@@ -114,7 +116,7 @@ class RunRecord:
                     sequences = {key: tuple(done.get(key, ())) for key in ("warnings", "files")}
                     known = {**done, **sequences, "decisions": tuple(decided)}
                     self.stages[name] = FinishedStage(name, **known)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{path} cannot be read ({error})", "choose another --output") from error
 
     def check(self, stages: Sequence[Stage]) -> None:

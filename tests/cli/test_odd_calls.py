@@ -63,6 +63,9 @@ READERS = ("detect", "simulate", "train", "export")
 @pytest.mark.parametrize("case", corpus("transforms"), ids=lambda case: case["case"])
 def test_an_odd_transforms_json(case, reader, readers, broken_scene, tmp_path, capsys):
     edit_json(broken_scene / "transforms.json", case)
+    for name, content in case.get("beside", {}).items():
+        (broken_scene / name).unlink(missing_ok=True)
+        write(broken_scene / name, content)
     code = readers[reader](broken_scene)
     judge(case, reader, code, capsys.readouterr().err, tmp_path)
 
@@ -144,6 +147,9 @@ def test_an_odd_call(case, inputs, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "here"
     for name, text in {"there.txt": "", **case.get("files", {})}.items():
         write(folder / name, text)
+    for name, target in case.get("links", {}).items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).symlink_to(target.format(**inputs))
     monkeypatch.chdir(folder)
     for name, value in case.get("environment", {}).items():
         monkeypatch.setenv(name, value)

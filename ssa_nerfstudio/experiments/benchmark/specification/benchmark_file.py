@@ -15,6 +15,8 @@ from ssa_nerfstudio.experiments.configuration import build, locate, read
 Densification = Literal["adc", "mcmc"]
 DEMO = "demo"
 """The `data` of a scene that stands for the built-in one."""
+_MAX_MARKS = 1000
+"""More points of a curve cannot be told apart in a figure."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class SceneEntry:
             raise ValueError(f"{self.title}: downscale must be at least 1 and eval_interval at least 2")
         if not 0 <= self.exposure <= 1 or (self.exposure and self.artifact):
             raise ValueError(f"{self.title}: exposure must be in [0, 1], and 0 where the photos carry an artifact")
-        if not re.fullmatch(r"[A-Za-z0-9_.]+", self.title):
+        if not re.fullmatch(r"[A-Za-z0-9_.]*[A-Za-z0-9_][A-Za-z0-9_.]*", self.title):  # "." and ".." are folders
             raise ValueError(f"scene name {self.title!r} must consist of letters, digits, _ and dots; state one: name")
         if self.artifact is None and (self.clean or self.mask or not self.clean_tests):
             raise ValueError(f"{self.title}: clean, mask and clean_tests are for scenes that state their artifact")
@@ -111,6 +113,8 @@ class Tradeoff:
     def __post_init__(self) -> None:
         if self.steps < 1 or self.marks < 1:
             raise ValueError("steps and marks must be at least 1")
+        if self.marks > _MAX_MARKS:
+            raise ValueError(f"marks must be at most {_MAX_MARKS}, got {self.marks}")
         for name, settings in self.knobs.items():
             if not settings:
                 raise ValueError(f"knobs.{name} needs at least one setting")
@@ -133,8 +137,8 @@ class Benchmark:
     """Captures."""
     parts: tuple[Part, ...] = ()
     """The matrix, most important first."""
-    method: str = "ssa-splatfacto"
-    """nerfstudio method that every row starts from: ssa-splatfacto, or ssa-splatfacto-paper."""
+    method: Literal["ssa-splatfacto", "ssa-splatfacto-paper"] = "ssa-splatfacto"
+    """nerfstudio method that every row starts from."""
     protocol: Literal["own", "paper"] = "own"
     """paper: data, splits, resolutions, caps and schedules are the paper's, so that its metrics are comparable."""
     model: dict[str, Any] = field(default_factory=dict)
