@@ -16,7 +16,7 @@ from ssa_nerfstudio.evidence.photo_exposure import DAMPING, MIN_SCALE, OUTLIER_S
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
 SIGNIFICANCE = 0.001
-"""Chance that modes of equal variance have as large a radial share: below it there is a falloff."""
+"""Chance that modes of equal variance have as large a share in radial ones, and in r^2: below both is a falloff."""
 MAX_SAMPLES = 20_000
 """Of more, those of a regular subset of the points are used: a falloff has five parameters."""
 MAX_VIEWS = 128
@@ -40,10 +40,9 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
     modes = _modes(height, width).to(samples.color.device)
     radial = modes[:, :RADIAL_MODES]
     found = _regression(samples, modes).square()
-    other = found[RADIAL_MODES:].mean()
-    ratio = float(found[:RADIAL_MODES].mean() / other) if other > 0 else 0.0
     log_transmittance = modes.new_zeros(height * width)
-    if fdtrc(RADIAL_MODES, modes.shape[1] - RADIAL_MODES, ratio) < SIGNIFICANCE:
+    # Of a lens nearly all is r^2; of a watermark in the middle of the frame, which is radial, too, it is not.
+    if max(_chance(found, RADIAL_MODES), _chance(found, 1)) < SIGNIFICANCE:
         # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
         log_transmittance = radial @ _regression(samples, radial)
     clearest = log_transmittance.kthvalue(max(1, round((1 - CLEAR_SHARE) * height * width))).values
@@ -52,6 +51,13 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
         return samples.color.new_ones(height, width, 1)
     clear = log_transmittance[log_transmittance >= clearest].mean()
     return (log_transmittance - clear).exp().clamp(_GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+
+
+def _chance(variances: Tensor, first: int) -> float:
+    """Probability that the first of some modes [K] of equal variance have as large a share as these (F-test)."""
+    others = variances[first:].mean()
+    ratio = float(variances[:first].mean() / others) if others > 0 else 0.0
+    return float(fdtrc(first, len(variances) - first, ratio))
 
 
 def _modes(height: int, width: int) -> Tensor:

@@ -21,6 +21,7 @@ NOT_RADIAL = {
     "a dark lower edge": 0.2 + 0.8 * torch.sigmoid((0.4 - Y) / 0.05),
     "an operator in the middle of the lower face": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X, Y) - 0.3) / 0.05),
     "a dark middle": (1 - 6 * (torch.hypot(X, Y) - 0.33).square()).clamp_min(0.2),
+    "a watermark in the middle": 1 + 2 * torch.sigmoid((0.15 - torch.hypot(X, Y)) / 0.02),
     "a finger": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X - 0.7, Y - 0.5) - 0.4) / 0.05),
 }
 
