@@ -1,0 +1,90 @@
+"""A row for each capture and artifact: off, paper's rule, default and oracle: `python benchmarks/rows.py RESULTS`
+
+From results of `ssa bench captures`; PSNR in dB, means over seeds.
+"""
+
+from __future__ import annotations
+
+import statistics
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.report.study import Study, finite, mean, studies
+from ssa_nerfstudio.experiments.benchmark.results import read_all
+
+MAX_LOSS = 0.3
+"""A default that is further behind the better of paper's rule and oracle is printed bold."""
+
+
+def cells(study: Study, effect: str, scene: str, densification: str) -> tuple[list[str], float | None]:
+    """off, paper's rule, default (worst view), oracle; and default minus the better of paper's rule and oracle."""
+    off, paper, ours, oracle, worst = (
+        mean(study.select(effect, scene, method, densification), metric)
+        for method, metric in (
+            ("3dgs", "psnr"),
+            ("paper", "psnr"),
+            ("default", "psnr"),
+            ("given", "psnr"),
+            ("default", "psnr worst"),
+        )
+    )
+    shown = ["" if value is None else f"{value:.2f}" for value in (off, paper, ours, oracle)]
+    if worst is not None:
+        shown[2] += f" ({worst:.1f})"
+    references = finite([paper, oracle])
+    return shown, None if ours is None or not references else ours - max(references)
+
+
+def marked(difference: float | None) -> str:
+    """A difference as a cell."""
+    if difference is None:
+        return ""
+    return f"{difference:+.2f}" if difference >= -MAX_LOSS else f"**{difference:+.2f}**"
+
+
+@dataclass
+class Command:
+    """Print a table for each length: a row for each capture and artifact."""
+
+    folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDERS")] = ()
+    """Output folders of `ssa bench`; several are added up."""
+
+    def run(self) -> None:
+        """Print.
+
+        Raises:
+            InputError: there are no results.
+        """
+        results, _ = read_all([*self.folders])
+        compared = [study for study in studies(results) if study.clean_tests]
+        if not compared:
+            raise InputError("no results with clean test photos", "name the --output of ssa bench captures")
+        for study in compared:
+            columns = ("off", "paper's rule", "default (worst view)", "oracle", "difference")
+            heads = [f"{d.upper()}: {column}" for d in study.densifications for column in columns]
+            print(f"\n{study.title}\n\n| | | {' | '.join(heads)} |\n|{'---|' * (2 + len(heads))}")
+            differences: list[list[float]] = [[] for _ in study.densifications]
+            for effect, scene in sorted(study.pairs, key=lambda pair: pair[1]):
+                row: list[str] = []
+                for found, densification in zip(differences, study.densifications, strict=True):
+                    shown, difference = cells(study, effect, scene, densification)
+                    row += [*shown, marked(difference)]
+                    found += [] if difference is None else [difference]
+                print(f"| `{scene}` | {effect} | {' | '.join(row)} |")
+            for densification, found in zip(study.densifications, differences, strict=True):
+                if found:
+                    middle, smallest = statistics.median(found), min(found)
+                    held = sum(value >= -MAX_LOSS for value in found)
+                    print(
+                        f"\n{densification.upper()}: mean {statistics.mean(found):+.2f}, median {middle:+.2f}, worst "
+                        f"{smallest:+.2f} dB; {held} of {len(found)} are at most {MAX_LOSS} dB behind."
+                    )
+
+
+if __name__ == "__main__":
+    run_script(Command)

@@ -1,0 +1,32 @@
+"""The table with a row for each capture and artifact, from results made up."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+from made_results import all_results, folder_of
+
+from benchmarks.rows import Command
+from ssa_nerfstudio.errors import InputError
+
+
+def test_a_row_compares_the_default_with_the_better_reference(tmp_path, capsys):
+    results = all_results()
+    for k, r in enumerate(results):
+        if (r.run.scene, r.run.effect, r.run.method, r.run.densification) == ("barn", "mud", "default", "adc"):
+            results[k] = dataclasses.replace(r, metrics={**r.metrics, "psnr": 20.0})
+    Command((folder_of(tmp_path, results),)).run()
+    printed = capsys.readouterr().out
+    missed, held = (
+        next(line for line in printed.splitlines() if f"`{scene}` | mud" in line) for scene in ("barn", "attic")
+    )
+    assert [cell.strip() for cell in missed.split("|")][7] == "**-0.35**"
+    assert [cell.strip() for cell in held.split("|")][7] == "+0.20"
+    assert "at most 0.3 dB behind" in printed
+
+
+def test_a_folder_without_results_is_refused(tmp_path):
+    (tmp_path / "results").mkdir()
+    with pytest.raises(InputError, match="no results"):
+        Command((tmp_path,)).run()
