@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.plugin.command_entry import report_in_one_line
+from ssa_nerfstudio.plugin.command_entry import report_in_one_line, resuming
 
 
 def called(entry_point: Callable[[], None]) -> None:
@@ -153,3 +153,16 @@ def test_settings_that_upstream_fails_at(settings, says, configure_training, tin
     config.timestamp = "now"
     with pytest.raises(InputError, match=says):
         config.setup(local_rank=0, world_size=1).setup()
+
+
+@pytest.mark.parametrize(
+    ("options", "resumed"),
+    [
+        (["--data", "my photos"], "--data 'my photos'"),
+        (["--load-dir", "old", "--data", "my photos"], "--data 'my photos'"),
+        (["--steps-per-save", "10", "--load-dir", "old", "--vis", "viewer"], "--steps-per-save 10 --vis viewer"),
+    ],
+)
+def test_the_command_that_resumes_has_one_load_dir_and_all_other_options(monkeypatch, options, resumed):
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/ns-train", "ssa-splatfacto", *options])
+    assert resuming(Path("run/models")) == f"ns-train ssa-splatfacto --load-dir run/models {resumed}"
