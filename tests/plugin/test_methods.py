@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import pytest
 from nerfstudio.configs.method_configs import method_configs
+from nerfstudio.engine.trainer import TrainerConfig
 
 from ssa_nerfstudio.plugin.methods import METHODS
 
-SPLATFACTO = method_configs["splatfacto"].optimizers
+SPLATFACTO = method_configs["splatfacto"]
+assert isinstance(SPLATFACTO, TrainerConfig)
+RATES = SPLATFACTO.optimizers
+VIEWER = SPLATFACTO.viewer
 SCHEDULE = ("lr_final", "max_steps", "warmup_steps", "lr_pre_warmup", "ramp")
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("group", sorted(SPLATFACTO))
+@pytest.mark.parametrize("group", sorted(RATES))
 def test_learning_rates_and_their_schedules_are_those_of_splatfacto(method, group):
-    ours, upstream = METHODS[method].optimizers[group], SPLATFACTO[group]
+    ours, upstream = METHODS[method].optimizers[group], RATES[group]
     assert ours["optimizer"].lr == upstream["optimizer"].lr
     assert (ours["scheduler"] is None) == (upstream["scheduler"] is None)
     if ours["scheduler"] is not None:
@@ -27,5 +31,5 @@ def test_learning_rates_and_their_schedules_are_those_of_splatfacto(method, grou
 def test_a_training_opens_the_viewer_and_ends_without_a_profile(method):
     config = METHODS[method]
     assert config.vis == "viewer"
-    assert config.viewer.num_rays_per_chunk == method_configs["splatfacto"].viewer.num_rays_per_chunk
+    assert config.viewer.num_rays_per_chunk == VIEWER.num_rays_per_chunk
     assert config.logging.profiler == "none"

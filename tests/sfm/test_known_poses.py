@@ -89,10 +89,10 @@ def test_a_model_that_was_moved_and_scaled_is_moved_back(seed, on_a_line):
     centers = rng.normal(size=(6, 3))
     if on_a_line:
         centers = centers[:1] + rng.normal(size=(6, 1)) * rng.normal(size=3)
-    turns = Rotation.random(6, random_state=seed).as_matrix()
+    turns = Rotation.from_quat(rng.normal(size=(6, 4))).as_matrix()
     poses = np.concatenate([turns, -turns @ centers[..., None]], axis=-1)
     model = model_of(poses)
-    turn = pycolmap.Rotation3d(Rotation.random(random_state=seed + 9).as_matrix())
+    turn = pycolmap.Rotation3d(Rotation.from_quat(rng.normal(size=4)).as_matrix())
     model.transform(pycolmap.Sim3d(rng.uniform(0.1, 9), turn, rng.normal(size=3)))
     align(model, {f"{number}.png": pose for number, pose in enumerate(poses[:5], 1)})
     for number, pose in enumerate(poses, 1):
