@@ -16,7 +16,7 @@ import tyro
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.report.study import Study, finite, mean, studies
+from ssa_nerfstudio.experiments.benchmark.report.study import MAX_LOSS, Study, finite, lead, mean, studies
 from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN
 
@@ -68,10 +68,9 @@ def thresholds(study: Study, densification: str) -> Iterator[Threshold]:
         where = f"{scene}, {effect}"
         runs = study.select(effect, scene, "default", densification)
         ours, clean = of(effect, scene, "default"), of(CLEAN, scene, "3dgs")
-        references = finite(of(effect, scene, method) for method in ("paper", "given"))
-        if ours is not None and references:
-            differences.append(ours - max(references))
-            yield Threshold(f"{where}: default - better of paper's rule and oracle", differences[-1], -0.3)
+        if (difference := lead(study, effect, scene, densification)) is not None:
+            differences.append(difference)
+            yield Threshold(f"{where}: default - better of paper's rule and oracle", difference, -MAX_LOSS)
         if ours is not None and clean is not None and runs[0].run.real:
             yield Threshold(f"{where}: default - the same photos without it", ours - clean, -1.0)
         gaps += [gap for run in runs if (gap := worst_gap(run)) is not None]

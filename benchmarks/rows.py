@@ -14,15 +14,12 @@ import tyro
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.report.study import Study, finite, mean, studies
+from ssa_nerfstudio.experiments.benchmark.report.study import MAX_LOSS, Study, lead, mean, studies
 from ssa_nerfstudio.experiments.benchmark.results import read_all
 
-MAX_LOSS = 0.3
-"""A default that is further behind the better of paper's rule and oracle is printed bold."""
 
-
-def cells(study: Study, effect: str, scene: str, densification: str) -> tuple[list[str], float | None]:
-    """off, paper's rule, default (worst view), oracle; and default minus the better of paper's rule and oracle."""
+def cells(study: Study, effect: str, scene: str, densification: str) -> list[str]:
+    """off, paper's rule, default (worst view), oracle."""
     off, paper, ours, oracle, worst = (
         mean(study.select(effect, scene, method, densification), metric)
         for method, metric in (
@@ -36,12 +33,11 @@ def cells(study: Study, effect: str, scene: str, densification: str) -> tuple[li
     shown = ["" if value is None else f"{value:.2f}" for value in (off, paper, ours, oracle)]
     if worst is not None:
         shown[2] += f" ({worst:.1f})"
-    references = finite([paper, oracle])
-    return shown, None if ours is None or not references else ours - max(references)
+    return shown
 
 
 def marked(difference: float | None) -> str:
-    """A difference as a cell."""
+    """A difference as a cell, bold where the default is further behind than it may be."""
     if difference is None:
         return ""
     return f"{difference:+.2f}" if difference >= -MAX_LOSS else f"**{difference:+.2f}**"
@@ -72,8 +68,8 @@ class Command:
             for effect, scene in sorted(study.pairs, key=lambda pair: pair[1]):
                 row: list[str] = []
                 for found, densification in zip(differences, study.densifications, strict=True):
-                    shown, difference = cells(study, effect, scene, densification)
-                    row += [*shown, marked(difference)]
+                    difference = lead(study, effect, scene, densification)
+                    row += [*cells(study, effect, scene, densification), marked(difference)]
                     found += [] if difference is None else [difference]
                 print(f"| `{scene}` | {effect} | {' | '.join(row)} |")
             for densification, found in zip(study.densifications, differences, strict=True):

@@ -16,6 +16,8 @@ METRICS = ("psnr", "psnr median", "psnr worst", "ssim", "flip")
 OVER_VIEWS = {"median": statistics.median, "worst": min}
 """What else is taken of a run's views; one bad view in sixteen moves a mean by as much as methods differ."""
 CATEGORY_ORDER = ("watermark", "ui", "dashboard", "rain", "mud", "finger", "occlusion", "vignette", "dust")
+MAX_LOSS = 0.3
+"""dB by which the default may be behind the better of paper's rule and oracle."""
 MEAN = "mean"
 """Stands for all categories of artifacts."""
 
@@ -162,3 +164,12 @@ def belongs(effect: str, kind: str) -> bool:
 
 def _position(name: str) -> int:
     return CATEGORY_ORDER.index(name) if name in CATEGORY_ORDER else len(CATEGORY_ORDER)
+
+
+def lead(study: Study, effect: str, scene: str, densification: str) -> float | None:
+    """PSNR of the default minus the better of paper's rule and oracle, dB; None where one side was not trained."""
+    ours, *references = (
+        mean(study.select(effect, scene, method, densification), "psnr") for method in ("default", "paper", "given")
+    )
+    known = finite(references)
+    return None if ours is None or not known else ours - max(known)
