@@ -8,6 +8,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from ssa_nerfstudio._system.named_pipes import refuse_pipe
 from ssa_nerfstudio.errors import InputError
 
 _REMEDY = "make it again, or remove ply_file_path from transforms.json to start from random points"
@@ -45,8 +46,7 @@ def check_points(path: Path) -> None:
         InputError: the file is missing, no PLY, empty or truncated, a coordinate is no number, or no point is finite.
     """
     try:
-        if path.is_fifo():
-            raise ValueError("it is a pipe")
+        refuse_pipe(path)
         with path.open("rb") as file:
             head = file.read(_HEADER)
             header, end, _ = head.partition(b"end_header\n")

@@ -12,6 +12,7 @@ import yaml
 from torch import Tensor
 
 from ssa_nerfstudio._system.counted_noun import counted
+from ssa_nerfstudio._system.named_pipes import refuse_pipe
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts, Overlay
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES
@@ -139,8 +140,7 @@ def data_of_run(config: Path) -> Path:
         InputError: config.yml cannot be read, or the dataset is no longer there.
     """
     try:
-        if config.is_fifo():
-            raise ValueError("it is a pipe")
+        refuse_pipe(config)
         manager = yaml.load(config.read_text(encoding="utf-8"), Loader=_Inert)["pipeline"]["datamanager"]
         data = Path(*(manager["data"] or manager["dataparser"]["data"]))
     except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError) as error:

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from ssa_nerfstudio._system.named_pipes import refuse_pipe
 from ssa_nerfstudio.errors import InputError
 
 _MIN_USED = 0.05
@@ -31,8 +32,7 @@ def read_mask(path: Path, width: int, height: int, inverted: bool = False) -> np
         InputError: it cannot be read, is of another shape, or leaves less than 5 % of the frame.
     """
     try:
-        if path.is_fifo():
-            raise ValueError("it is a pipe")
+        refuse_pipe(path)
         with Image.open(path) as image:
             gray = np.asarray(image.convert("L"))
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:

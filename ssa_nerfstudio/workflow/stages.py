@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
+from ssa_nerfstudio._system.named_pipes import refuse_pipe
 from ssa_nerfstudio.data.writing import write_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
@@ -106,8 +107,7 @@ class RunRecord:
             self._write()
             return
         try:
-            if path.is_fifo():
-                raise ValueError("it is a pipe")
+            refuse_pipe(path)
             for name, entry in json.loads(path.read_text(encoding="utf-8")).items():
                 self._choices[name] = dict(entry["choices"])
                 decided = self._decisions[name] = list(entry.get("decisions", []))
