@@ -14,16 +14,15 @@ from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 MAX_OPAQUE_DEVIATION = 0.2
-"""Deviation relative to the capture's (its 75th percentile) below which an opaque artifact may cover a pixel."""
+"""Deviation relative to the capture's (its 75th percentile) below which an opaque artifact may cover a pixel, and of an
+area relative to what surrounds it. On three captures dashboards and buttons have 0.01 to 0.07 of their surroundings,
+paths and skies between drops at least 0.45."""
 HALF_GRAY_LEVEL = 0.5 / 255
 """Deviations below this are low in any capture."""
 MIN_AREA = 16
 """Working pixels; smaller areas are ignored."""
 MIN_OUTLINE_SHARE = 0.5
 """Share of an area's outline that has to be static edges: a uniform artifact has them, a uniform sky does not."""
-MIN_OPAQUE_STEP = 1.6
-"""Natural logarithm of the ratio of the deviations outside and inside, from which on an area is opaque: a fifth. On
-three captures opaque dashboards and buttons have 2.6 to 4.5, paths and skies between drops at most 0.8."""
 _GRAY_LEVEL = 1 / 255
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
@@ -72,13 +71,13 @@ class EnclosedAreas:
         deviation does not rise.
         """
         areas = cv2.morphologyEx(self._hiding, cv2.MORPH_CLOSE, _NEIGHBORS)
-        level = np.log(self.deviation + _GRAY_LEVEL)
+        level = self.deviation + _GRAY_LEVEL
         kept = np.zeros_like(areas)
         for box, area in _connected_areas(areas, margin=4):
             outside = cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS)
             within = area > cv2.erode(area, _NEIGHBORS, iterations=2)
             unbounded = not outside.any() or not within.any()
-            if unbounded or np.median(level[box][outside]) - np.median(level[box][within]) >= MIN_OPAQUE_STEP:
+            if unbounded or np.median(level[box][within]) <= MAX_OPAQUE_DEVIATION * np.median(level[box][outside]):
                 kept[box] |= area
         return self._at_full_size(kept)
 
