@@ -15,6 +15,6 @@ os.kill(os.getpid(), signal.SIGTERM)
 
 
 def test_sigterm_still_ends_the_process_without_a_word():
-    done = subprocess.run([sys.executable, "-c", ENDED], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", ENDED], capture_output=True, text=True, timeout=300)
     assert done.returncode == -signal.SIGTERM
     assert done.stderr == ""

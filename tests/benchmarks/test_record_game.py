@@ -155,7 +155,7 @@ def test_a_rig_has_a_folder_a_lens_and_masks_for_each_camera(rooms, tmp_path):
 def test_what_cannot_be_recorded_is_refused_in_one_line_and_leaves_nothing(options, said, tmp_path):
     pytest.importorskip("vizdoom")
     command = [sys.executable, record_game.__file__, "--output", str(tmp_path / "out"), *options]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.splitlines()) == 1

@@ -102,7 +102,7 @@ def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
         assert time.monotonic() < deadline
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=300)
     return subprocess.CompletedProcess(words, process.returncode, out, err)
 
 

@@ -49,7 +49,7 @@ def killed(tmp_path_factory) -> tuple[Path, dict[Path, bytes]]:
     assert len(at_work(folder)) > 1
     process.send_signal(signal.SIGKILL)
     process.wait()
-    deadline = time.monotonic() + 30  # numba compiles for seconds without letting go of the interpreter
+    deadline = time.monotonic() + 120  # numba compiles for seconds without letting go of the interpreter
     while at_work(folder):
         assert time.monotonic() < deadline, "its runs go on"
         time.sleep(0.1)
