@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,9 @@ from PIL import Image
 
 from benchmarks.guard_cost import Training
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence.detection import Detection
+from ssa_nerfstudio.evidence.statistics import ImageStatistics
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin import overlay_setup as first_look
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
@@ -145,6 +149,34 @@ def test_one_line_says_what_was_decided(clean_scene, tiny_scene, tmp_path, capsy
         told = " ".join(capsys.readouterr().out.split())
         assert expected in told
         assert "--pipeline.model.overlay" in told
+
+
+def test_too_few_static_edges_are_called_that(tiny_scene, tmp_path, capsys, monkeypatch, configure_training):
+    """A capture has significantly many of them, and what exceeds those of shifted captures is no artifact."""
+    detection = first_look.detect
+
+    def few(statistics: ImageStatistics, **_: bool) -> Detection:
+        found = detection(statistics)
+        return replace(found, verdict="none", coverage=0.0, mask=torch.zeros_like(found.mask))
+
+    monkeypatch.setattr(first_look, "detect", few)
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 1)
+    config.pipeline.datamanager.dataparser.load_3D_points = False
+    config.pipeline.setup(device="cpu")
+    assert (
+        "The photos show no static artifact (12 views, some edges stand still, but too few to be one): training "
+        "without an overlay. (--pipeline.model.overlay on trains with one.)"
+        in " ".join(capsys.readouterr().out.split())
+    )
+
+
+def test_a_constant_start_looks_at_no_photo(tiny_scene, tmp_path, configure_training):
+    """The artifact is detected, and its overlay starts as one of which nothing is known."""
+    model = {"overlay": "auto", "overlay_start": "constant"}
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 1, model)
+    (overlay,) = config.pipeline.setup(device="cpu").model.artifacts.learned()
+    blank = ScreenSpaceOverlay(48, 64).state_dict()
+    assert all(torch.equal(values, blank[name]) for name, values in overlay.state_dict().items())
 
 
 def test_auto_is_the_default_except_for_the_papers_protocol():

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import sys
 from collections.abc import Callable
+from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import torch
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.plugin.command_entry import report_in_one_line, resuming
+from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, report_in_one_line, resuming
+from ssa_nerfstudio.plugin.methods import METHODS
 
 
 def called(entry_point: Callable[[], None]) -> None:
@@ -115,6 +119,30 @@ def test_options_that_upstream_fails_at(options, says, refused, tiny_scene, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("seed", [0, 2**32 - 1])
+def test_seeds_at_both_ends_are_taken(seed):
+    config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    config.machine.seed = seed
+    config.check()
+
+
+@pytest.mark.parametrize(
+    ("program", "module", "expected"),
+    [
+        ("/bin/ns-train", None, True),
+        ("train.py", "nerfstudio.scripts.train", True),
+        ("train.py", "mine.scripts.train", False),
+        ("ssa", None, False),
+    ],
+)
+def test_what_is_a_command_of_nerfstudio(program, module, expected, monkeypatch):
+    main = ModuleType("__main__")
+    main.__spec__ = module and ModuleSpec(module, None)
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    monkeypatch.setattr(sys, "argv", [program])
+    assert is_nerfstudio_command() == expected
+
+
 @pytest.mark.parametrize(
     ("reader", "says"),
     [
@@ -136,6 +164,7 @@ def test_a_dataset_of_another_kind(refused, tiny_scene, tmp_path):
     words = ("--data", tiny_scene, "--vis", "tensorboard", "--output-dir", tmp_path / "out", "colmap")
     line = refused("ns-train", "ssa-splatfacto", *words)
     assert line.startswith(f"nerfstudio cannot read {tiny_scene} (Colmap path")
+    assert line.endswith("; look at the options of its reader")
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,10 @@ def test_a_strip_too_small_to_be_found_gets_an_overlay_and_one_line(capsys):
     assert {face.name for face, each in zip(FACES, learned, strict=True) if each.overlay is None} == {"up"}
     told = " ".join(capsys.readouterr().out.split())
     assert told.count("--pipeline.model.overlay") == 6, "one line for each face"
-    assert "The artifact reaches into the photos of frame_left from the face beside them" in told
+    assert (
+        "The artifact reaches into the photos of frame_left from the face beside them: training with an overlay. "
+        "(--pipeline.model.overlay off trains without.)" in told
+    )
     assert re.search(
         r"of frame_down have a static artifact \(opaque, at least in part, [\d.]+% of the undistorted frame\): ", told
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
@@ -107,6 +108,55 @@ def test_every_layer_is_what_its_name_says(model, camera):
     clear = plain["overlay_alpha"][..., 0] < 0.02
     assert clear.any()
     assert ((artifact[clear] - 0.425).abs() - 0.075).abs().max() < 0.03
+
+
+def test_depth_is_that_of_what_is_seen_however_transparent_it_is(model, camera):
+    solid = model.get_outputs_for_camera(camera)
+    before = model.opacities.detach().clone()
+    try:
+        with torch.no_grad():
+            model.opacities.fill_(-4.0)
+        faint = model.get_outputs_for_camera(camera)
+    finally:
+        with torch.no_grad():
+            model.opacities.copy_(before)
+    seen = faint["accumulation"] > 0.01
+    assert seen.any()
+    assert faint["accumulation"].max() < 0.9
+    near, far = solid["depth"].min(), solid["depth"].max()
+    assert faint["depth"][seen].min() > 0.9 * near
+    assert faint["depth"][seen].median() < far
+
+
+def test_a_crop_leaves_what_is_inside_of_it(model, camera):
+    whole = model.get_outputs_for_camera(camera)
+    x, y, z = model.means.detach().median(dim=0).values.tolist()
+    box = OrientedBox.from_params((x, y, z), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    inside = box.within(model.means.detach())
+    assert 0 < inside.sum() < len(inside)
+    cropped = model.get_outputs_for_camera(camera, obb_box=box)
+    before = model.opacities.detach().clone()
+    try:
+        with torch.no_grad():
+            model.opacities[~inside] = -30.0
+        alone = model.get_outputs_for_camera(camera)
+    finally:
+        model.set_crop(None)
+        with torch.no_grad():
+            model.opacities.copy_(before)
+    torch.testing.assert_close(cropped["rgb"], alone["rgb"], atol=1e-4, rtol=0)
+    assert not torch.allclose(cropped["rgb"], whole["rgb"], atol=0.05)
+
+
+def test_a_crop_around_nothing_shows_the_background(model, camera):
+    box = OrientedBox.from_params((1e4, 0.0, 0.0), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
+    try:
+        cropped = model.get_outputs_for_camera(camera, obb_box=box)
+    finally:
+        model.set_crop(None)
+    assert cropped["rgb"].shape == (48, 64, 3)
+    assert torch.equal(cropped["rgb"], model.background_color.expand(48, 64, 3))
+    assert not cropped["accumulation"].any()
 
 
 def test_strength_scales_the_matte(model, camera):

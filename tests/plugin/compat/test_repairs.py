@@ -88,6 +88,16 @@ def test_gsplats_relocation_needs_cuda_and_runs_on_a_cpu_when_repaired():
     assert scales.shape == (4, 3)
 
 
+def test_gsplats_covariances_are_those_of_scaled_and_turned_axes_when_repaired():
+    gsplat_repairs.enable_mcmc_on_cpu()
+    quarter_turn = torch.tensor([[1.0, 0.0, 0.0, 1.0]])  # about z, not normalized
+    covariances, _ = gsplat.strategy.ops.quat_scale_to_covar_preci(
+        quarter_turn, torch.tensor([[1.0, 2.0, 3.0]]), compute_preci=False, triu=False
+    )
+    assert covariances is not None
+    torch.testing.assert_close(covariances[0], torch.diag(torch.tensor([4.0, 1.0, 9.0])))
+
+
 def test_gsplat_resets_opacities_at_step_0():
     params = torch.nn.ParameterDict({"opacities": torch.full((3,), 3.0)})
     optimizers: dict[str, torch.optim.Optimizer] = {"opacities": torch.optim.Adam([params["opacities"]])}

@@ -58,12 +58,14 @@ def test_every_writer_but_the_console_is_thinned(monkeypatch, every, seen):
 def table(monkeypatch):
     """A function that makes a table of a training of some steps, on a terminal or not, and logs steps to it."""
 
-    def make(steps: int, every: int, terminal: bool = False) -> tuple[ConsoleTable, Any]:
+    def make(
+        steps: int, every: int, terminal: bool = False, banner: list[str] | None = None
+    ) -> tuple[ConsoleTable, Any]:
         monkeypatch.setattr("sys.stdout.isatty", lambda: terminal, raising=False)
         monkeypatch.setattr(
             writer, "GLOBAL_BUFFER", {"steps_per_log": every, "max_iter": steps, "step": 0, "events": {}}
         )
-        made = ConsoleTable(LocalWriterConfig(max_log_size=10))
+        made = ConsoleTable(LocalWriterConfig(max_log_size=10), banner)
 
         def log(step: int, **scores: float) -> None:
             events: dict[str, Any] = {"Train Loss": 0.25, "Train Metrics Dict": {"psnr": 11.0, **scores}}
@@ -107,7 +109,9 @@ def test_without_a_loss_there_is_no_row(table, capsys, monkeypatch):
     assert capsys.readouterr().out == ""
 
 
-@pytest.mark.parametrize(("steps", "every", "rows"), [(30_000, 10, 101), (999, 10, 100), (5_000, 10, 101), (50, 10, 6)])
+@pytest.mark.parametrize(
+    ("steps", "every", "rows"), [(30_000, 10, 101), (999, 10, 100), (5_000, 10, 101), (50, 10, 6), (1_500, 10, 151)]
+)
 def test_a_file_gets_about_a_hundred_rows(table, capsys, steps, every, rows):
     made, log = table(steps, every)
     assert made.config.max_log_size == 0
@@ -123,3 +127,14 @@ def test_a_terminal_gets_every_row(table, capsys):
         log(step)
     out = capsys.readouterr().out
     assert all(f"{step} (" in out for step in (0, 10, 20))
+
+
+def test_the_banner_stays_below_the_rows_of_a_terminal(table, capsys):
+    """It says where the viewer is."""
+    _, log = table(30_000, 10, terminal=True, banner=["viewer: http://localhost:7007"])
+    for step in (0, 10, 20):
+        log(step)
+    *_, row, rule, last = capsys.readouterr().out.splitlines()
+    assert "20 (" in row
+    assert set(rule.strip(" \x1b[0m")) == {"-"}
+    assert "viewer: http://localhost:7007" in last
