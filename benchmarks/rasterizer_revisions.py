@@ -16,10 +16,10 @@ from pathlib import Path
 from statistics import median
 
 import torch
+from rasterizers import random_scene
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.rasterizers import random_scene
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.rasterization import rasterizer

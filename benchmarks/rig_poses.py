@@ -14,8 +14,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from sfm_accuracy import center_errors
 
-from benchmarks.sfm_accuracy import center_errors
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.sources import read_sources
 from ssa_nerfstudio.sfm.photos_to_dataset import process

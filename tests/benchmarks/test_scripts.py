@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,23 @@ def test_the_readme_lists_every_script():
     rows = re.findall(r"^\| `(\w+\.py)` \|.*`python benchmarks/(\w+\.py)", (FOLDER / "README.md").read_text(), re.M)
     assert [listed for listed, _ in rows] == [called for _, called in rows]
     assert sorted(listed for listed, _ in rows) == sorted(path.name for path in FOLDER.glob("*.py"))
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.py")))
+def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypatch, capsys):
+    """As a process would, which has the script's folder on its path, and imports all libraries anew."""
+    for imported in [each for each in sys.modules if each.partition(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, imported)
+    monkeypatch.setitem(sys.modules, "benchmarks", None)  # cannot be imported
+    monkeypatch.syspath_prepend(FOLDER)
+    monkeypatch.chdir(FOLDER.parent)
+    monkeypatch.setattr(sys, "argv", [f"benchmarks/{name}", "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(f"benchmarks/{name}", run_name="__main__")
+    assert end.value.code == 0
+    out, err = capsys.readouterr()
+    assert out.startswith(f"usage: python benchmarks/{name}")
+    assert err == ""
 
 
 @pytest.mark.parametrize(
