@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 
 from ssa_nerfstudio._system import terminal_messages
-from ssa_nerfstudio._system.environment import check_environment
+from ssa_nerfstudio._system.environment import check_environment, check_working_directory
 from ssa_nerfstudio.errors import InputError, SSAError
 
 COMMANDS = {
@@ -98,10 +98,7 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
 
 
 def _run(name: str, options: list[str]) -> None:
-    try:
-        os.getcwd()
-    except OSError as error:  # as where it was deleted; libraries end the process without a reason there
-        raise InputError(f"the working directory cannot be used ({error.strerror})", "change to another") from error
+    check_working_directory()
     check_environment()
     if name not in COMMANDS:
         raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")

@@ -111,9 +111,14 @@ def test_a_result_that_nobody_reads(tmp_path):
     ("before", "says"),
     [
         ("mkdir x; cd x; rmdir ../x", "the working directory cannot be used (No such file or directory)"),
+        (f"for n in {{1..20}}; do mkdir {'d' * 250}; cd {'d' * 250}; done", "cannot be used (File name too long)"),
         ("ulimit -v 1500000", "free memory"),
     ],
-    ids=["a working directory that was deleted", "too little memory for its libraries"],
+    ids=[
+        "a working directory that was deleted",
+        "a working directory beyond the longest path",
+        "too little memory for its libraries",
+    ],
 )
 def test_what_a_command_is_started_in(before, says, tiny_scene, tmp_path):
     command = f'{before}; exec "$0" -m ssa_nerfstudio detect --data "$1"'
