@@ -25,15 +25,19 @@ BROKEN_PIPE_EXIT_CODE = 141
 """Of a command whose output nobody reads any more, as shells have it."""
 
 
-def plain_console() -> Console:
-    """A console for text that holds paths: `[x]` is no markup and `:x:` no emoji, and lines are not wrapped."""
+def plain_console(stderr: bool = False) -> Console:
+    """A console for text that holds paths: `[x]` is no markup and `:x:` no emoji, and lines are not wrapped.
+
+    Args:
+        stderr: print to the error stream, where the output is for programs.
+    """
     from rich.console import Console  # not before ctrl+c is handled
 
     class PlainConsole(Console):
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError  # and not rich's exit with code 1
 
-    return PlainConsole(highlight=False, soft_wrap=True, markup=False, emoji=False)
+    return PlainConsole(stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 def refusal(error: BaseException) -> InputError | None:

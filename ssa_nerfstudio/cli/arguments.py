@@ -8,6 +8,7 @@ import re
 import shutil
 from collections.abc import Sequence
 from contextlib import redirect_stderr
+from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
@@ -15,6 +16,9 @@ import tyro
 from ssa_nerfstudio.errors import InputError
 
 T = TypeVar("T")
+
+STANDARD_OUTPUT = Path("-")
+"""What an option for an output means by convention."""
 
 _NO_HELP = ("For full helptext", "Argument helptext", "Available subcommands")
 """Beginnings of what tyro says beside the error: nerfstudio's subcommands are readers of fifteen dataset formats."""
@@ -34,7 +38,8 @@ def read(command: type[T], arguments: list[str], program: str, description: str,
         defaults: `default`, an instance whose values hold where no option is given.
 
     Raises:
-        InputError: an option is unknown, missing, or has a value that it does not take.
+        InputError: an option is unknown, missing, or has a value that it does not take; or --output is -, which would
+            be the name of a folder or file.
         SystemExit: of code 0, after --help.
     """
     report = io.StringIO()
@@ -42,11 +47,16 @@ def read(command: type[T], arguments: list[str], program: str, description: str,
         os.environ["COLUMNS"] = str(_NARROWEST)
     try:
         with redirect_stderr(report):
-            return tyro.cli(command, args=arguments, prog=program, description=description, **defaults)
+            made = tyro.cli(command, args=arguments, prog=program, description=description, **defaults)
     except SystemExit as end:
         if not end.code:
             raise
-    raise InputError(f"{_one_line(report.getvalue())} ({program} --help)")
+        raise InputError(f"{_one_line(report.getvalue())} ({program} --help)") from None
+    for name in ("output", "output_dir"):
+        if getattr(made, name, None) == STANDARD_OUTPUT:
+            option = name.replace("_", "-")
+            raise InputError(f"--{option} -: {program} does not write to the standard output", "name a place on a disk")
+    return made
 
 
 def split_forwarded(arguments: list[str], prefixes: Sequence[str]) -> tuple[list[str], tuple[tuple[str, ...], ...]]:

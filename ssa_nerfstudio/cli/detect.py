@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.cli.arguments import STANDARD_OUTPUT
 from ssa_nerfstudio.errors import InputError
 
 _MAX_DRAWS = 100_000
@@ -24,7 +25,8 @@ class Command:
     """Folder to write evidence.png, mask_nerfstudio.png and mask_colmap.png to; must not exist. Default:
     outputs/detection/NAME, where an earlier detection is replaced."""
     json: Path | None = None
-    """File to write verdict, coverage, p_value, views and more of each camera to; must not exist."""
+    """File to write verdict, coverage, p_value, views and more of each camera to; must not exist. -: the standard
+    output, and what else is said goes to the error stream."""
     draws: int = 200
     """Number of captures of randomly shifted views to compare with, from 200 to 100000."""
     frames: int = 200
@@ -43,10 +45,11 @@ class Command:
                 raise InputError(f"--{name} must be at least {lowest}, got {value}")
         if self.draws > _MAX_DRAWS:
             raise InputError(f"--draws must be at most {_MAX_DRAWS}, got {self.draws}")
-        if self.json is not None and not self.json.parent.is_dir():
-            raise InputError(f"--json {self.json}: there is no folder {self.json.parent}", "make it first")
-        if self.json is not None and (self.json.is_dir() or self.json.is_file()):
-            raise InputError(f"--json {self.json} exists already", "remove it or name another file")
+        file = None if self.json == STANDARD_OUTPUT else self.json
+        if file is not None and not file.parent.is_dir():
+            raise InputError(f"--json {file}: there is no folder {file.parent}", "make it first")
+        if file is not None and (file.is_dir() or file.is_file()):
+            raise InputError(f"--json {file} exists already", "remove it or name another file")
         if self.output is not None and self.output.exists():
             raise InputError(f"{self.output} exists already", "remove it or choose another --output")
 
@@ -88,15 +91,18 @@ class Command:
 
         self.check()
         output = self.place()
-        console = plain_console()
+        printed = self.json == STANDARD_OUTPUT
+        console = plain_console(stderr=printed)
         cameras = read_cameras(self.data, self.frames)
         found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
         if self.output is None:
             shutil.rmtree(output, ignore_errors=True)
         with staged_folder(output) as folder:
             write_detections(folder, found)
-            if self.json is not None:
+            if self.json is not None and not printed:
                 write_text(self.json, detections_to_json(found))
+        if printed:
+            print(detections_to_json(found), end="", flush=True)
         for name, detection in found.items():
             camera = f"{name}: " if len(found) > 1 else ""
             console.print(f"{camera}{verdict_in_words(detection)}")

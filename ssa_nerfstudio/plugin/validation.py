@@ -64,9 +64,11 @@ def check_machine(machine: MachineConfig) -> None:
 
 
 def check_output(folder: Path) -> None:
-    """Refuse what tensorboard and COLMAP cannot write to."""
+    """Refuse what tensorboard and COLMAP cannot write to, and what by convention is no folder."""
     if not is_text(str(folder)):
         raise InputError(f"--output-dir {folder}: the name is no text in UTF-8", "choose another folder")
+    if folder == Path("-"):
+        raise InputError("--output-dir -: a training does not go to the standard output", "choose another folder")
 
 
 def check_port(port: int | None) -> None:

@@ -56,6 +56,16 @@ def test_a_folder_of_photos_is_enough(tmp_path, capsys):
     assert f"Train with an overlay: ssa run {data} --output OUT" in said
 
 
+def test_a_dash_writes_json_alone_to_the_standard_output(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    main(["detect", "--data", str(photos(tmp_path / "photos")), "--output", "found", "--json", "-"])
+    out, err = capsys.readouterr()
+    assert [group["verdict"] for group in json.loads(out)["groups"]] == ["opaque"]
+    assert "a static artifact over" in err
+    assert "found: evidence.png, and masks whose black is the artifact" in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["found", "photos"]
+
+
 def test_detection_needs_no_console(tmp_path, capsys):
     (camera,) = read_cameras(photos(tmp_path / "photos"), 200)
     assert detect_camera(camera, threads=1).verdict == "opaque"
