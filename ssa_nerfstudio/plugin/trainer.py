@@ -38,6 +38,7 @@ from ssa_nerfstudio.plugin.training.schedules import scaled
 from ssa_nerfstudio.plugin.validation import (
     check_checkpoint,
     check_device,
+    check_intervals,
     check_length,
     check_machine,
     check_output,
@@ -75,6 +76,7 @@ class SSATrainerConfig(TrainerConfig):
         check_port(self.viewer.websocket_port)
         check_device(self.machine.device_type)
         check_settings(self.pipeline.model, self.machine.device_type)
+        check_intervals(self)
         check_length(self.max_num_iterations, self.pipeline.datamanager.camera_res_scale_factor)
 
 

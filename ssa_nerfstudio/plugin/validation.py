@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import math
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,8 @@ from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
+
     from ssa_nerfstudio.plugin.settings import ModelSettings
 
 
@@ -85,6 +88,25 @@ def check_length(steps: int, scale_factor: float) -> None:
         raise InputError(
             f"--pipeline.datamanager.camera-res-scale-factor must be above 0, got {scale_factor}", "1 keeps the size"
         )
+
+
+def check_intervals(config: TrainerConfig) -> None:
+    """Refuse numbers of steps between two events that nerfstudio divides by, or takes without their sign."""
+    lowest = {
+        "steps_per_save": 0,  # 0: never, but for the end
+        "steps_per_eval_batch": 0,  # 0: never
+        "steps_per_eval_image": 0,
+        "steps_per_eval_all_images": 0,
+        "logging.steps_per_log": 1,
+        "logging.max_buffer_size": 1,
+        "logging.local_writer.max_log_size": 0,  # 0: no limit
+    }
+    for name, least in lowest.items():
+        if (value := attrgetter(name)(config)) < least:
+            raise InputError(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
+    for group, steps in config.gradient_accumulation_steps.items():
+        if steps < 1:
+            raise InputError(f"--gradient-accumulation-steps must be at least 1, got {steps} for {group}")
 
 
 def check_device(device: torch.device | str) -> None:

@@ -111,6 +111,13 @@ def test_memory_that_runs_out_is_said_in_one_line(refused, run, monkeypatch):
         (("--machine.num-devices", "2"), "--machine.num-devices 2: a training uses one device; leave it at 1"),
         (("--machine.num-machines", "2"), "--machine.num-machines 2: a training uses one device; leave it at 1"),
         (("--viewer.websocket-port", "99999"), "--viewer.websocket-port must be from 1 to 65535, got 99999"),
+        (("--logging.steps-per-log", "0"), "--logging.steps-per-log must be at least 1, got 0"),
+        (("--steps-per-save", "-5"), "--steps-per-save must be at least 0, got -5"),
+        (
+            ("--gradient-accumulation-steps", "means", "0"),
+            "--gradient-accumulation-steps must be at least 1, got 0 for",
+        ),
+        (("--output-dir", "-"), "--output-dir -: a training does not go to the standard output"),
     ],
 )
 def test_options_that_upstream_fails_at(options, says, refused, tiny_scene, tmp_path, monkeypatch):
