@@ -6,7 +6,7 @@ Tola et al., DAISY (PAMI 2010), and color.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,12 +24,14 @@ SIDE = 800
 """Side to which photos are resized for Stable Diffusion, pixels: 16 for each cell."""
 TIMESTEP = 261
 """Of 1000: how much noise is added before the features are read."""
+DRAWS = 4
+"""Of that noise; the features are their mean."""
 LAYER = 1
 """Block of the U-Net's upward path whose output they are: 1280 channels."""
 WEIGHTS = "stabilityai/stable-diffusion-2-1, CreativeML Open RAIL++-M licence"
 
 
-def hand_made(photos: Sequence[Tensor]) -> Iterator[Tensor]:
+def hand_made(photos: Iterable[Tensor]) -> Iterator[Tensor]:
     """DAISY descriptors and mean colors of photos [H, W, 3] in [0, 1]: [107, h, w], max(h, w) = GRID.
 
     Each half is scaled to unit variance over the photo, so that texture and color count alike.
@@ -49,7 +51,7 @@ def hand_made(photos: Sequence[Tensor]) -> Iterator[Tensor]:
         yield torch.cat([_standardized(texture), _standardized(color)])
 
 
-def diffusion(folder: Path, photos: Sequence[Tensor], device: torch.device) -> Iterator[Tensor]:
+def diffusion(folder: Path, photos: Iterable[Tensor], device: torch.device) -> Iterator[Tensor]:
     """Features of Stable Diffusion for photos [H, W, 3] in [0, 1]: [1280, 50, 50] with the weights of version 2.1.
 
     Args:
@@ -64,17 +66,18 @@ def diffusion(folder: Path, photos: Sequence[Tensor], device: torch.device) -> I
     found: list[Tensor] = []
     hook = pipeline.unet.up_blocks[LAYER].register_forward_hook(lambda _, __, output: found.append(output))
     noise = torch.Generator().manual_seed(0)
-    prompt, _ = pipeline.encode_prompt("", device, 1, do_classifier_free_guidance=False)
+    prompt, _ = pipeline.encode_prompt("", device, DRAWS, do_classifier_free_guidance=False)
     time = torch.tensor([TIMESTEP], device=device)
     try:
         with torch.no_grad():
             for photo in photos:
-                resized = F.interpolate(photo.permute(2, 0, 1)[None].to(device), size=(SIDE, SIDE), mode="bilinear")
-                latent = pipeline.vae.encode((2.0 * resized - 1.0).to(pipeline.vae.dtype)).latent_dist.mean
-                latent = latent * pipeline.vae.config.scaling_factor
-                drawn = torch.randn(latent.shape, generator=noise).to(latent)
-                pipeline.unet(pipeline.scheduler.add_noise(latent, drawn, time), time, encoder_hidden_states=prompt)
-                yield found.pop()[0].float()
+                planes = photo.permute(2, 0, 1)[None].to(device)
+                resized = F.interpolate(planes, size=(SIDE, SIDE), mode="bicubic", antialias=True).clamp(0.0, 1.0)
+                encoded = pipeline.vae.encode((2.0 * resized - 1.0).to(pipeline.vae.dtype)).latent_dist
+                latents = torch.cat([encoded.sample(noise) for _ in range(DRAWS)]) * pipeline.vae.config.scaling_factor
+                drawn = torch.randn(latents.shape, generator=noise).to(latents)
+                pipeline.unet(pipeline.scheduler.add_noise(latents, drawn, time), time, encoder_hidden_states=prompt)
+                yield found.pop().float().mean(dim=0)
     finally:
         hook.remove()
 

@@ -7,6 +7,7 @@ Source: the paper and its code (Apache-2.0), written anew.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -104,14 +105,20 @@ class SpotlessModel(RobustModel):
 
     def examine(self, datamanager: SSADatamanager) -> None:
         """Compute the features of all photos; segment them, or make the network that reads them."""
-        photos = [self.get_gt_img(view["image"])[..., :3] for view in datamanager.cached_train]
-        stated = self.config.features
-        found = hand_made(photos) if stated == "hand-made" else diffusion(Path(stated), photos, self.device)
+        found = self._features(view["image"] for view in datamanager.cached_train)
         if self.config.grouping == "agg":
             self._grids = [ward_clusters(grid, self.config.segments).to(self.device) for grid in found]
         else:
             self._grids = [grid.to(self.device) for grid in found]
             self.beside["inlier_network"] = InlierNetwork(self._grids[0].shape[0]).to(self.device)
+
+    def _features(self, photos: Iterable[Tensor]) -> Iterator[Tensor]:
+        """Grids of features of cached photos [H, W, 3 or 4]."""
+        if self.config.features == "hand-made":
+            # At the resolution that training starts with: 50 cells along a side need no more.
+            return hand_made(self.get_gt_img(photo)[..., :3] for photo in photos)
+        whole = (photo[..., :3].float() / (255.0 if photo.dtype == torch.uint8 else 1.0) for photo in photos)
+        return diffusion(Path(self.config.features), whole, self.device)
 
     def inlier_weights(self, residuals: Tensor, batch: dict) -> Tensor:
         """The share of a segment's inliers, or the network's output; its bounds are kept for the loss."""

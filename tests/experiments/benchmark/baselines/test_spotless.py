@@ -6,6 +6,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from baselines.training import train
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.baselines import dense_features, spotless
 
@@ -81,6 +82,24 @@ def test_features_of_stable_diffusion_are_read_through_diffusers(tmp_path, monke
     assert [grid.shape for grid in first] == [(8, 8, 8)] * 2
     assert all(torch.equal(*pair) for pair in zip(first, again, strict=True))
     assert not torch.allclose(first[0], first[1])
+
+
+@pytest.mark.parametrize(("features", "seen"), [("hand-made", (24, 32, 3)), ("weights", (48, 64, 3))])
+def test_stable_diffusion_sees_whole_photos_at_whatever_resolution_training_starts(
+    capture, tmp_path, monkeypatch, features, seen
+):
+    shapes = []
+
+    def found(photos):
+        for photo in photos:
+            assert 0 <= float(photo.min()) < float(photo.max()) <= 1
+            shapes.append((*photo.shape,))
+            yield torch.zeros(3, 5, 5)
+
+    monkeypatch.setattr(spotless, "hand_made", found)
+    monkeypatch.setattr(spotless, "diffusion", lambda folder, photos, device: found(photos))
+    train("spotless-mlp", capture("transient"), tmp_path, 1, features=features, num_downscales=1)
+    assert shapes == [seen] * 24
 
 
 def test_a_folder_without_weights_is_refused_with_what_to_download(tmp_path):
