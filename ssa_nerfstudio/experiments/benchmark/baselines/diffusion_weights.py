@@ -27,14 +27,22 @@ def require(weights: str, what: str) -> None:
         raise InputError(f"diffusers is not installed, which {weights} needs", "pip install '.[diffusion]'") from error
 
 
-def load(weights: str, what: str, device: torch.device, offload: bool, kind: str = "DiffusionPipeline") -> Any:
-    """Load a pipeline: half precision on CUDA (bfloat16), single elsewhere.
+def load(
+    weights: str,
+    what: str,
+    device: torch.device,
+    offload: bool,
+    precision: torch.dtype,
+    kind: str = "DiffusionPipeline",
+) -> Any:
+    """Load a pipeline.
 
     Args:
         weights: a folder as diffusers saves a pipeline, or a hub's id that is in its cache or may be downloaded.
         what: which weights are meant and under which licence, for messages.
         device: where it runs.
         offload: keep only the part that is at work on the GPU.
+        precision: of the weights on CUDA; single elsewhere.
         kind: the class; `DiffusionPipeline` takes the one that the weights name, their own code included.
 
     Raises:
@@ -43,7 +51,7 @@ def load(weights: str, what: str, device: torch.device, offload: bool, kind: str
     require(weights, what)
     import diffusers
 
-    precision = torch.bfloat16 if device.type == "cuda" else torch.float32
+    precision = precision if device.type == "cuda" else torch.float32
     remote = {"trust_remote_code": True} if kind == "DiffusionPipeline" else {}
     try:
         with enough_memory(weights):

@@ -6,7 +6,6 @@ step and resolution of the authors' example. Source: their model card and code.
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +42,8 @@ class DifixConfig(SSASplatfactoModelConfig):
     _target: type = field(default_factory=lambda: DifixModel)
     weights: str = ""
     """Folder of the weights of nvidia/difix_ref or nvidia/difix, or that id."""
+    reference: bool = True
+    """Show the nearest training photo to the model, as nvidia/difix_ref wants; nvidia/difix wants none."""
     area: int = AREA
     """Pixels of the resolution at which renders are enhanced."""
     generator_seed: int = 0
@@ -59,16 +60,16 @@ class DifixModel(BaselineModel):
 
     def examine(self, datamanager: SSADatamanager) -> None:
         """Load the weights, which is known to work before hours of training, and keep the training photos."""
-        self._pipeline = load(self.config.weights, WEIGHTS, self.device, self.config.offload)
+        self._pipeline = load(self.config.weights, WEIGHTS, self.device, self.config.offload, torch.float32)
         self._photos = [view["image"] for view in datamanager.cached_train]
-        self._positions = datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3].to(self.device)
+        self._poses = datamanager.train_dataset.cameras.camera_to_worlds.to(self.device)
 
     def get_outputs(self, camera: Cameras) -> dict[str, Tensor | None]:
         """splatfacto's outputs; outside training `rgb` is enhanced, and `rendered` is what it was made of."""
         drawn = super().get_outputs(camera)
         if not self.training and self._pipeline is not None and drawn["rgb"] is not None:
-            distances = (self._positions - camera.camera_to_worlds[0, :3, 3].to(self.device)).norm(dim=1)
-            drawn["rendered"], drawn["rgb"] = drawn["rgb"], self.enhance(drawn["rgb"], int(distances.argmin()))
+            nearest = int(pose_distances(self._poses, camera.camera_to_worlds[0].to(self.device)).argmin())
+            drawn["rendered"], drawn["rgb"] = drawn["rgb"], self.enhance(drawn["rgb"], nearest)
         return drawn
 
     @torch.no_grad()
@@ -78,12 +79,11 @@ class DifixModel(BaselineModel):
         size = fitted(width, height, self.config.area, 8)
         photo = self.get_gt_img(self._photos[reference])[..., :3]
         image, nearest = (_picture(each).resize(size, Image.Resampling.LANCZOS) for each in (render, photo))
-        takes = inspect.signature(self._pipeline.__call__).parameters
         with enough_memory(self.config.weights):
             enhanced = self._pipeline(
                 PROMPT,
                 image=image,
-                **({"ref_image": nearest} if "ref_image" in takes else {}),  # nvidia/difix has none
+                ref_image=nearest if self.config.reference else None,
                 num_inference_steps=1,
                 timesteps=[TIMESTEP],
                 guidance_scale=0.0,
@@ -91,6 +91,20 @@ class DifixModel(BaselineModel):
             ).images[0]
         pixels = np.asarray(resized_back(enhanced, width, height), np.float32) / 255.0
         return torch.from_numpy(pixels).to(render)
+
+
+def pose_distances(poses: Tensor, pose: Tensor) -> Tensor:
+    """Distance of positions plus angle between orientations (radians), as the authors choose a reference.
+
+    Args:
+        poses: camera to world [N, 3, 4].
+        pose: one more [3, 4].
+
+    Returns:
+        [N].
+    """
+    cosines = ((poses[:, :, :3] * pose[:, :3]).sum(dim=(1, 2)) - 1.0) / 2.0
+    return (poses[:, :, 3] - pose[:, 3]).norm(dim=1) + torch.acos(cosines.clamp(-1.0, 1.0))
 
 
 def _picture(image: Tensor) -> Image.Image:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
 from PIL import Image
 
-from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.writing import staged_file, staged_folder
 from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, Capture
 from ssa_nerfstudio.experiments.benchmark.baselines.diffusion_weights import (
@@ -36,6 +37,8 @@ PROMPTS = {
     "rain": "remove the rain drops on the camera lens",
     "finger": "remove the finger in front of the camera lens",
     "occlusion": "remove the object in front of the camera lens",
+    "vignette": "remove the dark corners of the picture",
+    "dust": "remove the dust on the camera lens",
     "bonnet": "remove the car bonnet at the bottom of the picture",
 }
 """Instruction by artifact; those of dashboard and mud are the paper's."""
@@ -81,10 +84,11 @@ def write_dataset(capture: Capture, folder: Path) -> None:
     todo = [(number, view) for number, view in enumerate(views) if not (kept / f"{number:05d}.png").exists()]
     prompt = stated.prompt or PROMPTS.get(capture.artifact, OTHERWISE)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    pipeline = load(stated.weights, WEIGHTS, device, stated.offload, "FluxKontextPipeline") if todo else None
+    pipeline = None
+    if todo:
+        pipeline = load(stated.weights, WEIGHTS, device, stated.offload, torch.bfloat16, "FluxKontextPipeline")
     began = time.monotonic()
-    for start in range(0, len(todo), stated.batch):
-        some = todo[start : start + stated.batch]
+    for some in batches(todo, stated.batch):
         photos = [Image.fromarray(dataset.read_photo(view)) for _, view in some]
         width, height = fitted(*photos[0].size, stated.area, 16)
         assert pipeline is not None
@@ -115,6 +119,15 @@ def write_dataset(capture: Capture, folder: Path) -> None:
     for path in kept.iterdir():
         path.unlink()
     kept.rmdir()
+
+
+def batches(views: Sequence[tuple[int, View]], size: int) -> Iterator[list[tuple[int, View]]]:
+    """Up to `size` numbered views at a time, all of one frame size: a pipeline restores a batch at one resolution."""
+    alike: dict[tuple[int, int], list[tuple[int, View]]] = {}
+    for number, view in views:
+        alike.setdefault(view.size, []).append((number, view))
+    for same in alike.values():
+        yield from (same[start : start + size] for start in range(0, len(same), size))
 
 
 BASELINE = Baseline(

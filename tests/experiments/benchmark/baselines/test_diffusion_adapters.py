@@ -14,9 +14,12 @@ import torch
 from PIL import Image
 
 from baselines.training import photos_of, train
+from ssa_nerfstudio.cameras.lens import Lens
+from ssa_nerfstudio.data.dataset import View
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.baselines import diffusion_weights, flux_kontext
+from ssa_nerfstudio.experiments.benchmark.baselines import diffusion_weights, difix3d, flux_kontext
 from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Capture
+from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 
 pytest.importorskip("diffusers", reason="pip install '.[diffusion]'")
 
@@ -48,6 +51,17 @@ def test_difix_enhances_test_renders_of_any_size_with_the_nearest_photo(capture,
     assert torch.equal(drawn["rgb"], enhance(model, drawn["rendered"], 5))  # its own photo is the nearest
     code = next(module for name, module in sys.modules.items() if name.endswith("pipeline_difix"))
     assert code.DifixPipeline.asked == ("remove degradation", (88, 64), (88, 64), [199], 0.0)
+    model.config.reference = False  # as the weights of nvidia/difix want it
+    enhance(model, drawn["rendered"], 5)
+    assert code.DifixPipeline.asked == ("remove degradation", (88, 64), None, [199], 0.0)
+
+
+def test_the_reference_looks_where_the_render_does():
+    turn = torch.tensor([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1.0]])  # half a turn about the vertical
+    here, aside = torch.zeros(3, 1), torch.tensor([[1.0], [0.0], [0.0]])
+    poses = torch.stack([torch.cat([turn, here], 1), torch.cat([torch.eye(3), aside], 1)])
+    found = difix3d.pose_distances(poses, torch.cat([torch.eye(3), here], 1))
+    torch.testing.assert_close(found, torch.tensor([torch.pi, 1.0]))
 
 
 def test_difix_does_not_touch_training(capture, difix, tmp_path):
@@ -70,6 +84,17 @@ def test_flux_restores_every_training_photo_and_leaves_the_rest(capture, flux, t
     record = json.loads((tmp_path / "restored" / "restoration.json").read_text())
     assert record["prompt"] == "remove the car dashboard occluding the view"
     assert record["seconds"] > 0
+
+
+def test_a_batch_has_photos_of_one_size_alone():
+    lenses = [Lens(*size, 50.0, 50.0, 32.0, 24.0) for size in ((64, 48), (48, 64), (64, 48), (64, 48))]
+    views = [(number, View(f"{number}.png", "train", lens, ())) for number, lens in enumerate(lenses)]
+    found = [[number for number, _ in batch] for batch in flux_kontext.batches(views, 2)]
+    assert found == [[0, 2], [3], [1]]
+
+
+def test_every_simulated_artifact_has_an_instruction_of_its_own():
+    assert len({flux_kontext.PROMPTS[name] for name in EFFECTS}) == len(EFFECTS)
 
 
 def test_flux_goes_on_where_it_was_interrupted_with_the_same_result(capture, flux, tmp_path, monkeypatch):
@@ -111,7 +136,7 @@ def test_a_folder_that_holds_no_weights_is_refused_in_one_line(tmp_path, content
         (folder / "model_index.json").write_text("{")
     with pytest.raises(InputError, match=re.escape(flux_kontext.WEIGHTS)) as refusal:
         diffusion_weights.load(
-            str(folder), flux_kontext.WEIGHTS, torch.device("cpu"), offload=False, kind="FluxKontextPipeline"
+            str(folder), flux_kontext.WEIGHTS, torch.device("cpu"), False, torch.float32, "FluxKontextPipeline"
         )
     assert "\n" not in str(refusal.value)
 
