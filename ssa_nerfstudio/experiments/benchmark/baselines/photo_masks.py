@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import torch
 from PIL import Image
 
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.writing import staged_folder
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.detection import detect
-from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.evidence.capture_detection import detect_camera, read_cameras
 from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, Capture
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 
@@ -44,10 +42,11 @@ def write_dataset(capture: Capture, folder: Path) -> None:
         InputError: photos of several cameras, or nothing is left to train on.
     """
     dataset = Dataset.read(capture.data, eval_interval=8)
-    if len({view.size for view in dataset.views}) > 1:
-        raise InputError(f"{capture.data} has photos of several sizes", "masks are made for one camera alone")
-    find = _true_area if capture.settings["mask_from"] == "truth" else _detected_area
-    area = find(capture, dataset)
+    camera, *others = read_cameras(capture.data, frames=0)
+    if others:
+        raise InputError(f"{capture.data} has several cameras", "masks are made for one camera alone")
+    truth = capture.settings["mask_from"] == "truth"
+    area = _true_area(capture, dataset.views[0].size) if truth else detect_camera(camera, threads=1).mask.numpy()
     if area.all():
         raise InputError(f"the artifact in {capture.data} covers every pixel", "nothing is left to train on")
     with staged_folder(folder) as part:
@@ -56,21 +55,13 @@ def write_dataset(capture: Capture, folder: Path) -> None:
         capture.write_copy(part, {view.path: {"mask_path": f"ignored/{MASK}"} for view in dataset.views})
 
 
-def _true_area(capture: Capture, dataset: Dataset) -> np.ndarray:
-    """Where the artifact is, bool [H, W] of the raw frame."""
+def _true_area(capture: Capture, size: tuple[int, int]) -> np.ndarray:
+    """Where the artifact is, bool [H, W] of the raw frame, whose size is given."""
     if capture.mask is not None:
-        height, width = dataset.views[0].size
+        height, width = size
         return np.asarray(Image.open(capture.mask).convert("L").resize((width, height))) > 127
     with np.load(capture.data / "layers" / "raw.npz") as layers:
-        if "T" not in layers:
-            raise InputError(f"{capture.data} has several cameras", "masks are made for one camera alone")
         return ((1 - layers["T"] > VISIBLE) | (layers["B"] > VISIBLE)).any(axis=2)
-
-
-def _detected_area(capture: Capture, dataset: Dataset) -> np.ndarray:
-    """Where `ssa detect` finds an artifact in the training photos, bool [H, W]; nowhere where it finds none."""
-    photos = (dataset.read_photo(view) for view in dataset.views if view.role == "train")
-    return detect(accumulate((torch.from_numpy(photo), None) for photo in photos)).mask.numpy()
 
 
 BASELINE = Baseline(MaskConfig, dataset=write_dataset)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,18 @@ def test_the_detected_mask_covers_a_dashboard_and_nothing_of_clean_photos(captur
     found = area(tmp_path / "dashboard")
     assert (found & true).sum() / (found | true).sum() > 0.8
     assert not area(tmp_path / "clean").any()
+
+
+@pytest.mark.parametrize("mask_from", ["truth", "detection"])
+def test_several_cameras_are_refused_though_their_photos_have_one_size(capture, tmp_path, mask_from):
+    folder = shutil.copytree(capture("dashboard"), tmp_path / "rig")
+    meta = json.loads((folder / "transforms.json").read_text())
+    length = meta.pop("fl_x")
+    for number, frame in enumerate(meta["frames"]):
+        frame["fl_x"] = length * (1.0 + 0.2 * (number % 2))
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    with pytest.raises(InputError, match="several cameras"):
+        write_dataset(Capture(folder, "dashboard", None, {"mask_from": mask_from}), tmp_path / "masked")
 
 
 def test_the_loss_leaves_out_what_is_masked(capture, tmp_path):
