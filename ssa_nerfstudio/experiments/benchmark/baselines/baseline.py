@@ -68,7 +68,8 @@ class Baseline:
     learning_rates: dict[str, float] = field(default_factory=dict)
     """Of the modules in `BaselineModel.beside`, by name."""
     per_photo: bool = False
-    """They belong to single photos: rates are raised by FULL_LENGTH / steps, up to MAX_OVERLAY_FACTOR as ours are."""
+    """They belong to single photos, each seen fewer times in a short training: rates are raised by FULL_LENGTH / steps,
+    up to MAX_OVERLAY_FACTOR."""
     dataset: Callable[[Capture, Path], None] | None = None
     """Writes the dataset that is trained on into a folder, where that is not the prepared one."""
     check: Callable[[dict[str, Any]], None] = lambda settings: None
