@@ -11,7 +11,12 @@ from pathlib import Path
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error, write_text
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.report import category_tables, detail_tables, difference_tables
+from ssa_nerfstudio.experiments.benchmark.report import (
+    category_tables,
+    detail_tables,
+    difference_tables,
+    real_tables,
+)
 from ssa_nerfstudio.experiments.benchmark.report.document import Document, Picture, Section, Table
 from ssa_nerfstudio.experiments.benchmark.report.latex import write_latex
 from ssa_nerfstudio.experiments.benchmark.report.picture_sheets import sheet
@@ -109,8 +114,12 @@ def _section(study: Study, with_paper: bool) -> Section:
     if not study.clean_tests:
         drawn = [detail_tables.by_mask(study), detail_tables.cost(study)]
         return Section(study.title, [], [table for table in drawn if table is not None])
+    if study.real:
+        results = [real_tables.real_by_method(study, with_paper), real_tables.real_by_scene(study, with_paper)]
+    else:
+        results = [category_tables.results_by_category(study, with_paper)]
     drawn = [
-        category_tables.results_by_category(study, with_paper),
+        *results,
         detail_tables.results_by_scene(study),
         category_tables.sensitivity(study, with_paper),
         category_tables.ablation(study, with_paper),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Sequence
 from itertools import product
 
 from ssa_nerfstudio.experiments.benchmark.report import paper_tables as paper
@@ -26,17 +27,16 @@ ABLATION = {
     "paper": "L_sparse + statistics init",
     "constant-start": "L_sparse + const. init",
 }
+THE_PAPER = "  the paper"
+"""First cell of a row with its figures."""
 Published = dict[tuple[str, str, str], paper.Triple]
 
 
 def results_by_category(study: Study, with_paper: bool) -> Table:
     """Table `results`: mean over the scenes of a category, cells ADC / MCMC."""
-    published = (paper.REAL if study.real else paper.RESULTS) if with_paper else {}
-    beside = {method for _, method, _ in published} - {*study.methods}
-    rows = [name for name in METHODS if name in beside or name in study.methods]
-    rows += [name for name in study.methods if name not in METHODS]
-    methods = [name for name in rows if name not in SENSITIVITY and name != "constant-start"]
-    return _by_category(study, methods, "Results by category", published)
+    published = paper.RESULTS if with_paper else {}
+    ablated = (*SENSITIVITY, "constant-start")
+    return _by_category(study, listed_methods(study, published, ablated), "Results by category", published)
 
 
 def sensitivity(study: Study, with_paper: bool) -> Table | None:
@@ -67,7 +67,7 @@ def ablation(study: Study, with_paper: bool) -> Table | None:
             if of == method:
                 figures = {m: FORMATS[m].format(v) for m, v in zip(paper.METRICS, triple, strict=True)}
                 shown = [figures.get(metric, "") for metric in METRICS]
-                rows.append([f"  the paper, {densification.upper()}", *shown, deviation])
+                rows.append([f"{THE_PAPER}, {densification.upper()}", *shown, deviation])
     headings = ["Configuration", *(HEADINGS[metric] for metric in metrics)]
     return Table("Ablation", headings, rows, f"Mean over all artifacts; cells are {densification_names(study)}.")
 
@@ -78,28 +78,37 @@ def _by_category(study: Study, methods: list[str], name: str, published: Publish
     rows = []
     for kind in clean + study.kinds:
         values = {(m, metric): [study.value(kind, m, d, metric) for d in study.densifications] for m, metric in columns}
-        best = {metric: _best([v for m in methods for v in values[m, metric]], metric) for metric in METRICS}
+        best = {metric: best_of([v for m in methods for v in values[m, metric]], metric) for metric in METRICS}
         cells = [format_pair([format_value(v, c[1], best[c[1]]) for v in pair]) for c, pair in values.items()]
         rows.append([row_name(kind), *cells])
         if any(key[0] == kind for key in published):
-            rows.append(["  the paper", *_published(published, kind, methods, study.densifications)])
+            keys = [(kind, method) for method in methods]
+            rows.append([THE_PAPER, *published_cells(published, keys, METRICS, study.densifications)])
     headings = ["Artifact", *(f"{title(method)} {HEADINGS[metric]}" for method, metric in columns)]
     return Table(name, headings, rows, f"Mean over scenes; cells {densification_names(study)}. {NOTE}")
 
 
-def _best(values: list[Value | None], metric: str) -> str | None:
+def best_of(values: Iterable[Value | None], metric: str) -> str | None:
     """The best of a row and metric as a cell shows it; None where there is nothing to compare."""
     numbers = [value.mean for value in values if value is not None and not math.isnan(value.mean)]
     choose = min if metric == "flip" else max
     return FORMATS[metric].format(choose(numbers)) if len(numbers) > 1 else None
 
 
-def _published(published: Published, kind: str, methods: list[str], densifications: list[str]) -> list[str]:
+def published_cells(
+    published: Published, keys: Sequence[tuple[str, str]], metrics: Iterable[str], densifications: list[str]
+) -> list[str]:
+    """The paper's cells for every (category or scene, method) and metric; empty where it has none."""
     cells = []
-    for method in methods:
-        pairs = (zip(paper.METRICS, published.get((kind, method, d), ()), strict=False) for d in densifications)
+    for key, metric in product(keys, metrics):
+        pairs = (zip(paper.METRICS, published.get((*key, d), ()), strict=False) for d in densifications)
         figures = [dict(pair) for pair in pairs]
-        for metric in METRICS:
-            texts = [FORMATS[metric].format(figure[metric]) if metric in figure else "-" for figure in figures]
-            cells.append("" if set(texts) == {"-"} else " / ".join(texts))
+        texts = [FORMATS[metric].format(figure[metric]) if metric in figure else "-" for figure in figures]
+        cells.append("" if set(texts) == {"-"} else " / ".join(texts))
     return cells
+
+
+def listed_methods(study: Study, published: Published, without: tuple[str, ...]) -> list[str]:
+    """Methods that were run or that the paper has, in the matrix's order and candidates last."""
+    known = {*study.methods, *(method for _, method, _ in published)} - {*without}
+    return [name for name in METHODS if name in known] + [name for name in study.methods if name in known - {*METHODS}]

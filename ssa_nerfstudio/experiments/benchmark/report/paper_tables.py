@@ -12,7 +12,7 @@ METRICS = ("psnr", "ssim", "flip")
 
 
 def _flat(table: dict[str, Any]) -> dict[Any, Triple]:
-    """A nested table by tuples of its keys: (category, method, densification) or (method, densification)."""
+    """A nested table by tuples of its keys: (category or scene, method, densification) or (method, densification)."""
     flat: dict[Any, Triple] = {}
     for key, inner in table.items():
         if isinstance(inner, list):
@@ -25,6 +25,7 @@ def _flat(table: dict[str, Any]) -> dict[Any, Triple]:
 _PUBLISHED = read(locate("published", "ssa-3dgs"))
 RESULTS: dict[tuple[str, str, str], Triple] = _flat(_PUBLISHED["results"])
 REAL: dict[tuple[str, str, str], Triple] = _flat(_PUBLISHED["real"])
+REAL_BY_SCENE: dict[tuple[str, str, str], Triple] = _flat(_PUBLISHED["real_by_scene"])
 SENSITIVITY: dict[tuple[str, str, str], Triple] = _flat(_PUBLISHED["sensitivity"])
 REAL_SENSITIVITY: dict[tuple[str, str, str], Triple] = _flat(_PUBLISHED["real_sensitivity"])
 ABLATION: dict[tuple[str, str], Triple] = _flat(_PUBLISHED["ablation"])

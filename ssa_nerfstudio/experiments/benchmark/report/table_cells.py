@@ -18,7 +18,8 @@ HEADINGS = {
 }
 FORMATS = {name: "{:.3f}" if name in ("ssim", "flip") else "{:.2f}" for name in HEADINGS}
 _ROW_NAMES = {CLEAN: "Clean (Ref)", MEAN: "Mean", "ui": "UI elements", "rain": "Rain spots"}
-NOTE = "† a run diverged and is left out; (n/m): n of m scenes are there. Best of a row and metric in bold."
+MARKS = "† a run diverged and is left out; (n/m): n of m scenes are there."
+NOTE = f"{MARKS} Best of a row and metric in bold."
 
 
 def row_name(kind: str) -> str:
