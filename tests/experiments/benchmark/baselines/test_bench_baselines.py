@@ -15,8 +15,11 @@ import pytest
 import torch
 from nerfstudio.utils.eval_utils import eval_setup
 
+from baselines.training import train
 from ssa_nerfstudio.cli import main
+from ssa_nerfstudio.experiments.benchmark import baselines
 from ssa_nerfstudio.experiments.benchmark.results import read_all
+from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import METHODS, Method
 
 WITH_WEIGHTS = ("difix3d", "flux-kontext")
 BASELINES = ["spotless-mlp", "mask-detected", "desplat", "dc-gaussian"]
@@ -27,6 +30,25 @@ scenes:
 parts:
   - {{methods: [{methods}], effects: [dashboard], steps: 12}}
 """
+MODULE = """
+from dataclasses import dataclass, field
+from torch.nn.functional import avg_pool2d
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel
+from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
+
+@dataclass
+class BlurredConfig(SSASplatfactoModelConfig):
+    _target: type = field(default_factory=lambda: BlurredModel)
+    reach: int = 3
+
+class BlurredModel(BaselineModel):
+    def get_outputs(self, camera):
+        drawn, reach = super().get_outputs(camera), self.config.reach
+        return {**drawn, "composite": avg_pool2d(drawn["rgb"].permute(2, 0, 1), reach, 1, reach // 2).permute(1, 2, 0)}
+
+BASELINE = Baseline(BlurredConfig)
+"""
+"""A module of a baseline: photos are taken for blurred ones."""
 
 
 @pytest.fixture(scope="module")
@@ -69,6 +91,18 @@ def test_nerfstudio_loads_what_was_trained(folder, method):
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]
     assert torch.isfinite(pipeline.model.get_outputs_for_camera(camera)["rgb"]).all()
     assert len(pipeline.model.means) == result.gaussians
+
+
+def test_a_baseline_takes_one_module_and_one_line(capture, tmp_path, monkeypatch):
+    (tmp_path / "blurred.py").write_text(MODULE)
+    monkeypatch.setattr(baselines, "__path__", [*baselines.__path__, str(tmp_path)])
+    monkeypatch.setitem(METHODS, "blurred", Method("Blurred", baseline="blurred"))
+    _, pipeline = train("blurred", capture("clean"), tmp_path, 2, reach=5)
+    camera, _ = pipeline.datamanager.next_train(0)
+    pipeline.model.train()
+    drawn: Any = pipeline.model.get_outputs(camera)
+    expected = torch.nn.functional.avg_pool2d(drawn["rgb"].permute(2, 0, 1), 5, 1, 2).permute(1, 2, 0)
+    torch.testing.assert_close(drawn["composite"], expected)
 
 
 @pytest.mark.parametrize("method", WITH_WEIGHTS)
