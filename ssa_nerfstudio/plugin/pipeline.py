@@ -174,7 +174,7 @@ class SSAPipeline(VanillaPipeline):
     def _withheld_photos(self, key: torch.Tensor) -> list[NamedPhoto]:
         """Test photos of the camera with this key of `group_cameras` that have its artifact: stated ones are clean."""
         transforms = self._transforms()
-        if transforms is None or transforms.stated_split("test") or transforms.stated_split("val"):
+        if transforms is None or transforms.stated_split("val"):  # without it, nerfstudio takes no stated one
             return []
         photos, dataset = self.datamanager.cached_eval, self.datamanager.eval_dataset
         trained_on = {*self.datamanager.photo_names(self.datamanager.train_dataset)}

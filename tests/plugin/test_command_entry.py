@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import copy
 import sys
+import warnings
 from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
 
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.errors import InputError, TrainingStopped
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, report_in_one_line, resuming
 from ssa_nerfstudio.plugin.methods import METHODS
+from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 
 def called(entry_point: Callable[[], None]) -> None:
@@ -181,7 +184,10 @@ def test_a_dataset_of_another_kind(refused, tiny_scene, tmp_path):
         ({"ssim_lambda": 5.0}, "ssim-lambda must be at most 1, got 5.0"),
         ({"ssim_lambda": float("nan")}, "ssim-lambda must be at least 0, got nan"),
         ({"densify_grad_thresh": float("nan")}, "densify-grad-thresh is no number"),
-        ({"num_downscales": 6}, r"num-downscales 6 starts with one pixel in 2\^6, and a side of a photo has 48"),
+        (
+            {"num_downscales": 6},
+            r"num-downscales 6 starts with one pixel in 2\^6, and a side of a photo has 48; choose a smaller number$",
+        ),
     ],
 )
 def test_settings_that_upstream_fails_at(settings, says, configure_training, tiny_scene, tmp_path):
@@ -202,3 +208,61 @@ def test_settings_that_upstream_fails_at(settings, says, configure_training, tin
 def test_the_command_that_resumes_has_one_load_dir_and_all_other_options(monkeypatch, options, resumed):
     monkeypatch.setattr(sys, "argv", ["/somewhere/bin/ns-train", "ssa-splatfacto", *options])
     assert resuming(Path("run/models")) == f"ns-train ssa-splatfacto --load-dir run/models {resumed}"
+
+
+@pytest.fixture
+def trainer(tmp_path, monkeypatch):
+    """A trainer of `ns-train` that is at step 25; nothing is set up."""
+    monkeypatch.setattr(sys, "argv", ["ns-train", "ssa-splatfacto", "--data", "photos"])
+    made = SSATrainer.__new__(SSATrainer)
+    made.config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    made.config.timestamp, made.config.experiment_name = "now", "photos"
+    made.checkpoint_dir, made.step, made.training_state = tmp_path, 25, "training"
+    return made
+
+
+def test_ctrl_c_says_from_which_step_the_training_goes_on(trainer, tmp_path):
+    for step in (10, 20):
+        (tmp_path / f"step-{step:09d}.ckpt").touch()
+    with pytest.raises(TrainingStopped) as stopped, trainer._stopped_in_one_line():
+        raise KeyboardInterrupt
+    resumed = f"ns-train ssa-splatfacto --load-dir {tmp_path} --data photos"
+    assert str(stopped.value) == f"at step 25; go on from step 20: {resumed}"
+
+
+def test_ctrl_c_before_the_first_checkpoint(trainer):
+    with pytest.raises(TrainingStopped) as stopped, trainer._stopped_in_one_line():
+        raise KeyboardInterrupt
+    assert str(stopped.value) == "at step 25, before the first checkpoint; start again"
+
+
+def test_ctrl_c_after_the_training_closes_the_viewer(trainer):
+    trainer.training_state = "completed"
+    with trainer._stopped_in_one_line():
+        raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(("overlay", "why"), [("off", "the overlay was off"), ("auto", "none was detected")])
+def test_the_last_line_says_why_there_is_no_artifact(trainer, overlay, why, capsys):
+    trainer.config.pipeline.model.overlay = overlay
+    trainer.pipeline = SimpleNamespace(model=SimpleNamespace(artifacts=Artifacts()))
+    trainer._report_artifact(25)
+    splats, artifact = capsys.readouterr().out.splitlines()
+    assert (
+        splats
+        == "Splats: ssa export-splats --load-config outputs/photos/ssa-splatfacto/now/config.yml --output-dir splats"
+    )
+    assert artifact == f"Artifact: {why}, no overlay was trained"
+
+
+@pytest.mark.parametrize(
+    ("module", "shown"), [("torch.cuda.amp", 0), ("nerfstudio", 0), ("gsplat.x", 0), ("torchx", 1)]
+)
+def test_no_command_opens_with_warnings_of_libraries_about_each_other(module, shown, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["ns-train"])
+    monkeypatch.setattr(sys, "excepthook", sys.__excepthook__)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        report_in_one_line()
+        warnings.warn_explicit("use another", FutureWarning, "file.py", 1, module)
+    assert len(seen) == shown

@@ -57,6 +57,12 @@ def test_what_a_mask_excludes_is_no_part_of_the_loss(model):
     assert losses(model)["main_loss"] != masked
 
 
+def test_the_loss_of_a_test_photo_is_of_the_clean_render(model):
+    model.eval()
+    rendered = photometric_loss(torch.zeros(48, 64, 3), PHOTO, model.config.ssim_lambda)
+    torch.testing.assert_close(losses(model)["main_loss"], rendered)
+
+
 def test_several_overlays_weigh_as_much_as_one(model):
     one = losses(model)["sparsity"]
     weight = model.config.sparsity_weight

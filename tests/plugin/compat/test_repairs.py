@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import importlib.util
 import inspect
 import logging
@@ -137,6 +138,42 @@ def test_open3d_still_links_to_a_libusb_that_it_does_not_bring():
     assert any(open3d_libraries.LIBUSB.encode() in path.read_bytes() for path in libraries if "usb" not in path.name)
     # The copy that `make setup` puts there does not count.
     assert {path.parent for path in folder.rglob("libusb*")} <= {folder}
+
+
+@pytest.fixture
+def slim_system(tmp_path, monkeypatch) -> Path:
+    """No libusb on the system; open3d, and the wheel that holds one, in a folder."""
+    for name, library in (("open3d", "other.so"), ("libusb_package", "libusb-1.0.so")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").touch()
+        (tmp_path / name / library).touch()
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "platform", "linux")
+    return tmp_path
+
+
+def test_the_wheels_libusb_is_loaded_or_copied_where_the_system_has_none(slim_system, monkeypatch):
+    loaded = []
+
+    def load(library: str, mode: int = 0) -> None:
+        if library == open3d_libraries.LIBUSB:
+            raise OSError
+        loaded.append((library, mode))
+
+    monkeypatch.setattr(ctypes, "CDLL", load)
+    open3d_libraries.preload()
+    assert loaded == [(str(slim_system / "libusb_package/libusb-1.0.so"), ctypes.RTLD_GLOBAL)]
+    assert open3d_libraries.install() == slim_system / "open3d" / open3d_libraries.LIBUSB
+    assert (slim_system / "open3d" / open3d_libraries.LIBUSB).is_file()
+
+
+def test_the_systems_libusb_is_enough(slim_system, monkeypatch):
+    loaded = []
+    monkeypatch.setattr(ctypes, "CDLL", lambda library, mode=0: loaded.append(library))
+    open3d_libraries.preload()
+    assert open3d_libraries.install() is None
+    assert loaded == [open3d_libraries.LIBUSB] * 2
 
 
 @pytest.mark.parametrize(("found", "warned"), [("2.5.1", True), ("2.6.0", False), ("2.15.0", True)])
