@@ -21,7 +21,10 @@ from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 
 WIDTH, HEIGHT = 40, 30
 
-enable_mcmc_on_cpu()
+
+@pytest.fixture(autouse=True, scope="module")
+def mcmc_on_cpu() -> None:
+    enable_mcmc_on_cpu()
 
 
 def gaussians(n: int, seed: int = 0) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Optimizer]]:
@@ -78,6 +81,18 @@ def test_refinement_grows_and_prunes_as_gsplats_does():
         results.append(params)
     assert len(results[0]["means"]) > 80
     assert all(torch.equal(results[0][name], results[1][name]) for name in results[0])
+
+
+@pytest.mark.parametrize(("step", "small", "left"), [(11, 1, 1), (11, 0, 5), (10, 1, 5)])
+def test_what_is_too_large_is_removed_after_the_first_reset_unless_nothing_would_be_left(step, small, left):
+    params, optimizers = gaussians(5)
+    with torch.no_grad():
+        params["opacities"].fill_(2.0)
+        params["scales"].fill_(-4.0)
+        params["scales"][small:, 1] = 0.0  # as long as the scene's extent
+    strategy = AdaptiveDensityControl(reset_every=10)
+    removed = strategy._prune_gs(params, optimizers, strategy.initialize_state(scene_scale=1.0), step)
+    assert (removed, len(params["means"])) == (5 - left, left)
 
 
 def test_opacities_are_not_reset_before_the_first_step():
