@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.layer_estimate import SMOOTHNESS_FLOOR, _smoothness, estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import SMOOTHNESS_FLOOR, LayerEstimate, _smoothness, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
 HEIGHT, WIDTH = 36, 48
@@ -78,6 +78,16 @@ def test_layers_come_out_without_an_edge_or_a_decision_of_kind(name: str) -> Non
     assert found.adds_light() == (name == "additive")
     present = torch.maximum(1 - transmittance, addition.amax(dim=-1, keepdim=True)) > 0.3
     assert found.share() == pytest.approx(float(present.float().mean()), abs=0.03)
+
+
+@pytest.mark.parametrize(("hidden", "adds"), [(0.0, True), (0.9, False)])
+def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, adds: bool) -> None:
+    """Text of which too few points are seen to tell what it hides, alone and beside a soft, dark thumb."""
+    thumb = hidden * disc()
+    text = torch.zeros(HEIGHT, WIDTH, 1)
+    text[30:33, 2:20:3] = 0.2
+    layers = LayerEstimate(1 - thumb, torch.maximum(text, 0.1 * thumb).expand(-1, -1, 3), CLEAR[..., :1], 0 * thumb)
+    assert layers.adds_light() == adds
 
 
 def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> None:
