@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.changing_area import changing_area
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
-from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, LayerEstimate, estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import DETAIL_RADIUS, MIN_OPACITY, LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
 from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
@@ -71,7 +73,9 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor) -> LayerEstim
 
 
 @torch.no_grad()
-def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide: Tensor) -> None:
+def initialize_from(
+    overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide: Tensor, static: Tensor | None = None
+) -> None:
     """Initialize an overlay from estimated layers.
 
     Pixels whose estimated opacity is noise start clear. The sparsity loss weighs a pixel by its transmittance.
@@ -80,6 +84,8 @@ def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide:
         overlay: changed in place.
         estimate: at the working resolution of the overlay's frame.
         guide: see `guide_of`.
+        static: [H, W] bool: where static edges are (`Detection.mask`), something is in front of the scene, even if
+            the points are too few to say what; see `_likely_colors`. None: nowhere.
     """
     transmittance, addition = estimate.transmittance, estimate.addition
     if overlay.adds_light:
@@ -91,7 +97,9 @@ def initialize_from(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, guide:
     falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)
     layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition) / falloff, reduction).clamp(0, 1)
     present = enlarged(present, overlay.height, overlay.width, reduction) > 0
-    initialize_as(overlay, torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0])))
+    layers = torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0]))
+    likely = None if static is None else _likely_colors(layers, static, guide[..., :3].to(layers) / falloff, reduction)
+    initialize_as(overlay, layers, likely)
     if (falloff < 1).any():
         overlay.falloff = _at_overlay_resolution(falloff, overlay).to(overlay.falloff)
 
@@ -106,17 +114,20 @@ def ignore_changing(overlay: ScreenSpaceOverlay, estimate: LayerEstimate) -> Non
 
 
 @torch.no_grad()
-def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor) -> None:
-    """Initialize an overlay with layers T and B [H, W, 4] in its frame; it is changed in place."""
+def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor, likely: Tensor | None = None) -> None:
+    """Initialize an overlay with layers T and B [H, W, 4] in its frame; it is changed in place.
+
+    Args:
+        overlay: changed in place.
+        layers: T and B.
+        likely: the artifact's color where the layers have missed it, [H, W, 3] in [0, 1]; None: its mean color.
+    """
+    likely = _mean_color(layers) if likely is None else _at_overlay_resolution(likely, overlay)
     transmittance, addition = _at_overlay_resolution(layers, overlay).split((1, 3), dim=-1)
     if overlay.adds_light:
         overlay.initialize(addition, 1 - transmittance, transmittance)
         return
-    # Where the artifact was missed, its mean color is the likeliest. In the photos' mean color a matte would grow
-    # wherever a render is wrong: less contrast is a smaller error.
     alpha = smallest_matte(transmittance, addition)
-    total = alpha.sum()
-    likely = torch.where(total > 0, addition.sum(dim=(0, 1)) / total.clamp_min(1e-6), CONSTANT_INITIALIZATION[0])
     floor = INITIAL_MATTE_RANGE[0]
     overlay.initialize((addition + floor * likely) / (alpha + floor), alpha, transmittance)
 
@@ -124,6 +135,47 @@ def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor) -> None:
 def guide_of(statistics: ImageStatistics) -> Tensor:
     """Mean and deviation of the photos [H, W, 4], float32: where they have edges, an artifact may have some."""
     return torch.cat([statistics.mean(), statistics.deviation()], dim=-1).float()
+
+
+def _mean_color(layers: Tensor) -> Tensor:
+    """Mean color [3] of the artifact with layers T and B [H, W, 4]."""
+    transmittance, addition = layers.split((1, 3), dim=-1)
+    total = smallest_matte(transmittance, addition).sum()
+    return torch.where(total > 0, addition.sum(dim=(0, 1)) / total.clamp_min(1e-6), CONSTANT_INITIALIZATION[0])
+
+
+def _likely_colors(layers: Tensor, static: Tensor, mean: Tensor, reduction: int) -> Tensor:
+    """Color [H, W, 3] of the artifact where the layers have missed it.
+
+    It is the artifact's mean color: in the photos' mean color a matte would grow wherever a render is wrong, because
+    less contrast is a smaller error. But a connected part of what detection has found may be of another color, as
+    white text is beside a thumb: the color of what was found in it; if nothing was, and it is brighter than what is
+    around it where the mean color is darker, or the reverse, the photos' mean.
+
+    Args:
+        layers: T and B, [H, W, 4].
+        static: what detection has found, [H, W] bool.
+        mean: of the photos, [H, W, 3].
+        reduction: photo pixels a working pixel.
+    """
+    overall = _mean_color(layers)
+    if not static.any():
+        return overall.expand_as(mean)
+    found = static.cpu().numpy()
+    labels = torch.from_numpy(cv2.connectedComponents(found.astype(np.uint8))[1]).to(mean.device)
+    outside = 1 - found[..., None].astype(np.float32)
+    side = (2 * DETAIL_RADIUS + 1) * reduction
+    sums = cv2.blur(np.concatenate([mean.cpu().numpy() * outside, outside], axis=-1), (side, side))
+    around, seen = torch.from_numpy(sums).to(mean).split((3, 1), dim=-1)
+    around = torch.where(seen > 1e-6, around / seen.clamp_min(1e-6), mean)
+    agreement = ((mean - around) * (overall - around)).sum(dim=-1, keepdim=True)
+    transmittance, addition = layers.split((1, 3), dim=-1)
+    values = torch.cat([smallest_matte(transmittance, addition), addition, agreement], dim=-1).reshape(-1, 5)
+    parts = values.new_zeros(int(labels.max()) + 1, 5).index_add_(0, labels.flatten(), values)
+    matte, color, agreement = parts[labels].split((1, 3, 1), dim=-1)
+    missed = torch.where(agreement < 0, mean, overall.expand_as(mean))
+    own = torch.where(matte > 0, color / matte.clamp_min(1e-6), missed)
+    return torch.where(static.to(mean.device)[..., None], own, overall)
 
 
 def _papers_matte(statistics: ImageStatistics, within: Tensor | None) -> Tensor:

@@ -205,7 +205,7 @@ def _learned_overlay(
         part.say(*_in_words(detection, share, part.name, known))
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
-        initialize_from(started, found, guide)
+        initialize_from(started, found, guide, detection.mask)
         if config.ignore_changing:
             ignore_changing(started, found)
         return started

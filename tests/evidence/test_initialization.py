@@ -140,6 +140,35 @@ def test_an_overlay_starts_from_estimated_layers_and_clear_where_they_are_noise(
     assert (overlay.color()[:, half + rim :] - likely.clamp(0.002, 1)).abs().max() < 0.1
 
 
+@pytest.mark.parametrize(("brightness", "own"), [(200, True), (80, False)])
+def test_a_part_of_the_detected_area_starts_in_a_color_that_it_can_have(brightness: int, own: bool) -> None:
+    """Text that the points missed beside a dark thumb: white text cannot be the thumb's, dark text can."""
+    photo = torch.full((12, 26, 3), 90, dtype=torch.uint8)
+    photo[4:6, 21:24] = brightness
+    guide = guide_of(accumulate((photo, None) for _ in range(2)))
+    static = torch.zeros(12, 26, dtype=torch.bool)
+    static[:, :12] = static[4:6, 21:24] = True
+    overlay = ScreenSpaceOverlay(12, 26)
+    initialize_from(overlay, estimated(12, 26, 0.1, (0.3, 0.1, 0.1)), guide, static)
+    color, thumb = overlay.color(), torch.tensor([0.3, 0.1, 0.1]) / 0.9
+    assert (color[4:6, 21:24] - (brightness / 255 if own else thumb)).abs().max() < 0.01
+    assert (color[:, :12] - thumb).abs().max() < 0.01
+    assert (color[8:, 20:] - thumb).abs().max() < 0.01
+    assert overlay.matte()[4:6, 21:24].max() < 0.011
+
+
+def test_a_part_starts_in_the_color_of_what_was_found_in_it() -> None:
+    """Half of a white letter is found, and the rest of it starts white beside a dark thumb, too."""
+    layers = estimated(12, 26, 0.1, (0.3, 0.1, 0.1))
+    layers.transmittance[5, 21:23], layers.addition[5, 21:23] = 0.2, 0.8
+    guide = guide_of(accumulate((torch.full((12, 26, 3), 90, dtype=torch.uint8), None) for _ in range(2)))
+    static = torch.zeros(12, 26, dtype=torch.bool)
+    static[2:10, 21:23] = True
+    overlay = ScreenSpaceOverlay(12, 26)
+    initialize_from(overlay, layers, guide, static)
+    assert (overlay.color()[2:10, 21:23] > 0.7).all()
+
+
 def test_additive_light_starts_without_a_matte() -> None:
     _, statistics = capture(12, 16)
     overlay = ScreenSpaceOverlay(12, 16, adds_light=True)
