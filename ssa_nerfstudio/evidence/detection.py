@@ -100,7 +100,7 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0, known
     fine, coarse = (float(np.mean(scale)) for scale in zip(*null, strict=True))
     excess = shares[0] - fine, shares[1] - coarse
     interval = clopper_pearson(exceeding, draws)
-    enclosed = EnclosedAreas.from_edges(edges.mask, statistics)
+    enclosed = EnclosedAreas.from_edges(edges.mask, edges.outlines, statistics)
     few = p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_OPAQUE_SHARE)
     if few and not (known and edges.mask.any()):
         return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere, nowhere)

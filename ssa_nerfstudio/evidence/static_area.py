@@ -43,11 +43,17 @@ class EnclosedAreas:
     """uint8 [h, w]: areas of low deviation whose outline is static edges."""
 
     @classmethod
-    def from_edges(cls, edges: np.ndarray, statistics: ImageStatistics) -> EnclosedAreas:
-        """Find the areas that edges, uint8 [h, w], enclose."""
+    def from_edges(cls, edges: np.ndarray, outlines: np.ndarray, statistics: ImageStatistics) -> EnclosedAreas:
+        """Find the areas that edges enclose.
+
+        Args:
+            edges: static edges, uint8 [h, w].
+            outlines: edges and what continues them, likewise.
+            statistics: of the views.
+        """
         deviation = reduced(statistics.deviation().float(), statistics.brightness.reduction)[..., 0].cpu().numpy()
         low = low_deviation(deviation)
-        enclosed = _with_edge_outline(low.astype(np.uint8), cv2.dilate(edges, _NEIGHBORS, iterations=2))
+        enclosed = _with_edge_outline(low.astype(np.uint8), cv2.dilate(outlines, _NEIGHBORS, iterations=2))
         return cls(statistics, edges, deviation, low, enclosed)
 
     @property

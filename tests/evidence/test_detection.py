@@ -85,6 +85,18 @@ def test_an_opaque_board_is_found_with_its_uniform_inside():
     assert found.mask[:66].float().mean() < 0.01
 
 
+@pytest.mark.parametrize("views", [17, 20, 24, 33, 40])
+def test_a_plain_bar_is_covered_whatever_the_number_of_views(views):
+    """Its contrast falls along its outline: in the lower half the static edges are too weak by themselves."""
+    brightness = np.linspace(0.9, 0.1, HEIGHT)[:, None, None]
+    photos = [(photo * brightness).astype(np.uint8) for photo in capture(views)]
+    matte = np.zeros((HEIGHT, WIDTH))
+    matte[:, 96:112] = 1.0
+    found = detect(statistics_of(behind(photos, matte, color=0.05)))
+    assert found.mask[4:-4, 98:110].float().mean() > 0.95
+    assert found.verdict == "opaque"
+
+
 @pytest.mark.parametrize("views", [12, 40])
 def test_a_uniform_corner_is_found_though_it_has_few_edges(views):
     """A thumb, a tripod's leg: 6 % of the frame, whose edges alone would be too few to report."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ssa_nerfstudio.evidence.edge_evidence import _mostly_still, evidence_field
+from ssa_nerfstudio.evidence.edge_evidence import EdgeEvidence, _mostly_still, evidence_field
 
 
 def test_connected_edges_are_kept_if_a_tenth_of_them_is_still():
@@ -17,6 +17,23 @@ def test_connected_edges_are_kept_if_a_tenth_of_them_is_still():
     kept = _mostly_still(edges, still)
     assert (kept[2] == edges[2]).all()
     assert not kept[6].any()
+
+
+def test_weaker_edges_that_do_not_move_continue_an_outline():
+    """Rows: an edge that fades, one that fades and moves, and one that is nowhere strong."""
+    field = torch.zeros(13, 40)
+    field[2, 2:12], field[2, 12:30] = 8.0, 4.0
+    field[6, 2:12], field[6, 12:30] = 8.0, 4.0
+    field[10, 2:30] = 4.0
+    still = torch.ones(13, 40, dtype=torch.bool)
+    still[6, 12:] = False
+    edges = EdgeEvidence([], [still, still[::4, ::4]], [field, field[::4, ::4]])
+    outlines = edges.outlines
+    assert outlines[2, 2:30].all()
+    assert outlines[6, 2:12].all()
+    assert not outlines[6, 13:].any()
+    assert not outlines[10].any()
+    assert (edges.mask == (field >= 6).numpy()).all()
 
 
 def test_evidence_is_the_mean_gradient_over_its_standard_error():
