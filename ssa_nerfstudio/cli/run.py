@@ -100,7 +100,8 @@ class Command:
         console.print("Loading nerfstudio ...")
         from ssa_nerfstudio.data.panorama_entry import read_panorama
         from ssa_nerfstudio.data.transforms import Transforms
-        from ssa_nerfstudio.workflow.photos_to_splats import RECORD, stages
+        from ssa_nerfstudio.workflow.finished_training import Evaluation
+        from ssa_nerfstudio.workflow.photos_to_splats import EVALUATION, RECORD, stages
         from ssa_nerfstudio.workflow.resumable_training import config_file
         from ssa_nerfstudio.workflow.run_report import REPORT, report_page
         from ssa_nerfstudio.workflow.stage_display import terminal_display
@@ -116,7 +117,8 @@ class Command:
                     run_stages(todo, record, display)
             except KeyboardInterrupt as interrupt:
                 raise KeyboardInterrupt(f"stopped; the same command continues in {self.output}") from interrupt
-            commands = choices.commands(self.output, config_file(plan.training))
+            evaluation = Evaluation.read(self.output / EVALUATION)
+            commands = choices.commands(self.output, config_file(plan.training), evaluation)
             done = [record.stages[stage.name] for stage in todo]
             name = self.photos.resolve().stem
             on_sphere = read_panorama(Transforms.read(plan.data)) is not None

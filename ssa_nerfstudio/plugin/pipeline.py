@@ -14,11 +14,13 @@ from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataPars
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, fisheye_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
@@ -129,7 +131,17 @@ class SSAPipeline(VanillaPipeline):
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:
-        """Metrics over all test views, as upstream; with a warning where the test photos carry the artifact."""
+        """Metrics over all test views, as upstream; with a warning where the test photos carry the artifact.
+
+        Raises:
+            InputError: no photo is left to test on.
+        """
+        if not len(self.datamanager.eval_dataset):
+            raise InputError(
+                f"{_source(self.config)}: all {counted(len(self.datamanager.train_dataset), 'photo')} were trained on, "
+                "none is left to test on",
+                "of ten or more, nerfstudio leaves one in ten; or state test_filenames in transforms.json",
+            )
         metrics = super().get_average_eval_image_metrics(step, output_path, get_std)
         transforms = self._transforms() if len(self.model.artifacts) else None
         if transforms is not None and not transforms.test_photos_are_clean:

@@ -244,6 +244,11 @@ class SSATrainer(Trainer):
                 optimizers.guard.check(step)
         return loss, {name: value.detach() for name, value in losses.items()}, metrics
 
+    def eval_iteration(self, step: int) -> None:
+        """Evaluate as upstream does, which needs a test view."""
+        if len(self.pipeline.datamanager.eval_dataset):
+            super().eval_iteration(step)
+
     def train(self) -> None:
         """Train up to `max_num_iterations` steps in total; upstream's resumed runs train that many more."""
         planned = self.config.max_num_iterations

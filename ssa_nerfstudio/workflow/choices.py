@@ -14,6 +14,7 @@ from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.sfm.ingest import MAX_TRAINING_SIZE
+from ssa_nerfstudio.workflow.finished_training import Evaluation
 from ssa_nerfstudio.workflow.photos_to_splats import DATASET, TRAINING
 
 STEPS = 30_000
@@ -67,12 +68,13 @@ class Choices:
         data = ["--data", str(self.data(output).resolve())]
         return [*data, *place, *unattended, *saves, *self._training()]
 
-    def commands(self, output: Path, config: Path) -> dict[str, str]:
+    def commands(self, output: Path, config: Path, evaluation: Evaluation) -> dict[str, str]:
         """What a shell in the output folder runs to look at the run and to repeat its stages elsewhere.
 
         Args:
             output: folder of the run.
             config: its config.yml.
+            evaluation: of the run, which says what it has to be evaluated and exported.
         """
         photos, data = (os.path.relpath(path, output) for path in (self.photos, self.data(output)))
         run = ["--load-config", os.path.relpath(config, output.resolve())]
@@ -89,9 +91,11 @@ class Choices:
             ],
             "Artifact, masks, layers": ["ssa", "export-overlay", *run, "--output", "again/artifact", *whole],
         }
-        return {
-            name: shlex.join(words) for name, words in stages.items() if name != "Poses" or not is_dataset(self.photos)
-        }
+        if is_dataset(self.photos):
+            del stages["Poses"]
+        if not evaluation.views:
+            del stages["Evaluate"]
+        return {name: shlex.join(words) for name, words in stages.items()}
 
     def _training(self) -> list[str]:
         """Options that make a difference to the result; those of the dataset's reader come last, as ns-train asks."""

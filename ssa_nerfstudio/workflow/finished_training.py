@@ -38,9 +38,9 @@ class Evaluation:
     """Metrics of the test views."""
 
     metrics: dict[str, float]
-    """Means over the test views, by name."""
+    """Means over the test views, by name; empty where there are none, as of fewer than ten photos."""
     views: dict[str, dict[str, float]]
-    """Metrics by the photo's name."""
+    """Metrics by the photo's path in the dataset."""
     clean_test_views: bool
     """See `Transforms.test_photos_are_clean`."""
     pictured: list[PicturedGroup] = field(default_factory=list)
@@ -66,13 +66,13 @@ def evaluate(pipeline: SSAPipeline, data: Path, on_progress: ProgressCallback) -
         data: its dataset.
         on_progress: called after every view.
     """
-    names = [path.name for path in pipeline.datamanager.eval_dataset.image_filenames]
+    names = pipeline.datamanager.photo_names(pipeline.datamanager.eval_dataset)
     views = {}
     for name, (camera, batch) in zip(names, pipeline.datamanager.fixed_indices_eval_dataloader, strict=True):
         outputs = pipeline.model.get_outputs_for_camera(camera)
         views[name] = view_metrics(outputs, pipeline.model.target(outputs, batch))
         on_progress("test view", len(views), len(names))
-    keys = next(iter(views.values()))
+    keys = next(iter(views.values()), {})
     means = {key: sum(view[key] for view in views.values()) / len(views) for key in keys}
     return Evaluation(means, views, Transforms.read(data).test_photos_are_clean, _pictured(pipeline))
 

@@ -222,10 +222,14 @@ def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:
     with _emptied(plan.output / EVALUATION) as staged:
         evaluation.write(staged)
         write_view_pictures(pipeline, staged)
-    metrics = evaluation.metrics
+    metrics, trained = evaluation.metrics, len(pipeline.datamanager.train_dataset)
     del pipeline
     _free_memory()
     number = len(evaluation.views)
+    if not number:
+        return Result(
+            f"nothing to measure on: all {trained} photos were trained on; of ten or more, one in ten is left to test"
+        )
     views = f"PSNR of {number} photo{'s' * (number > 1)} that the training did not see:"
     if evaluation.clean_test_views or "composite_psnr" not in metrics:
         return Result(f"{views} {metrics['psnr']:.1f} dB")

@@ -97,6 +97,8 @@ def _ratio(picture: Path) -> float:
 def _figures(evaluation: Evaluation, exposed: bool) -> list[tuple[str, str, str]]:
     """Name, value and meaning of what was measured on the test views; `exposed`: whether exposures were learned."""
     metrics = evaluation.metrics
+    if not metrics:
+        return []
     rows, corrected = [], []
     if "composite_psnr" in metrics and not evaluation.clean_test_views:
         value = f"{metrics['composite_psnr']:.2f} dB"

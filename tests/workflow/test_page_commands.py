@@ -9,7 +9,15 @@ from pathlib import Path
 
 from ssa_nerfstudio.cli import arguments
 from ssa_nerfstudio.workflow.choices import Choices
+from ssa_nerfstudio.workflow.finished_training import Evaluation, PicturedGroup
 from ssa_nerfstudio.workflow.photos_to_splats import DATASET
+
+
+def evaluation(tested: bool = True, overlay: bool = True) -> Evaluation:
+    """Of a run with one camera."""
+    metrics = {"psnr": 20.0}
+    views = {"images/1.png": metrics} if tested else {}
+    return Evaluation(metrics if tested else {}, views, False, [PicturedGroup("camera_0", "a" if overlay else None)])
 
 
 def test_commands_of_ssa_are_taken_with_the_paths_of_the_run(tiny_scene, tmp_path):
@@ -18,7 +26,7 @@ def test_commands_of_ssa_are_taken_with_the_paths_of_the_run(tiny_scene, tmp_pat
     choices = Choices(photos, "ssa-splatfacto", 120, 1.0, ("--draws", "300"), ("--threads", "1"))
     config = output / "training/ssa-splatfacto/config.yml"
     read = {}
-    for name, command in choices.commands(output, config).items():
+    for name, command in choices.commands(output, config, evaluation()).items():
         program, called, *options = shlex.split(command)
         if program == "ssa":
             module = importlib.import_module(f"ssa_nerfstudio.cli.{called.replace('-', '_')}")
@@ -27,3 +35,9 @@ def test_commands_of_ssa_are_taken_with_the_paths_of_the_run(tiny_scene, tmp_pat
     assert (read["Poses"].train, read["Poses"].output) == (Path("../my photos"), Path("again/dataset"))
     assert read["Poses"].threads == 1
     assert read["Splats"].load_config == Path("training/ssa-splatfacto/config.yml")
+
+
+def test_a_run_without_test_photos_offers_no_evaluation(tiny_scene, tmp_path):
+    choices, config = Choices(tiny_scene, "ssa-splatfacto", 120, 1.0), tmp_path / "training/config.yml"
+    assert "Evaluate" in choices.commands(tmp_path, config, evaluation())
+    assert "Evaluate" not in choices.commands(tmp_path, config, evaluation(tested=False))
