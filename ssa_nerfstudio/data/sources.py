@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ssa_nerfstudio._system.counted_noun import counted
+from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio._system.natural_order import natural_order
 from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.photos import UPRIGHT, exif_orientation, open_photo
@@ -26,6 +27,8 @@ VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts"}
 _LOOKED_AT = 1000
 """Files and folders below a folder without photos, among which to look for some."""
 _ON_THE_SIDE = {5, 6, 7, 8}
+_NAMED = 5
+"""Photos that are named before they are counted."""
 
 
 class SourceCamera(NamedTuple):
@@ -161,20 +164,10 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
     if len(photos) < min_photos:
         raise InputError(f"{path} holds {counted(len(photos), 'photo')}, {min_photos} are needed", "add more")
     groups = _by_frame(photos)
-    (size, orientation), *others = groups
-    for other in others:
-        photo = groups[other][0]
-        if other[1] != orientation:
-            raise InputError(
-                f"{photo} has EXIF orientation {other[1]}, {photos[0].name} has {orientation}: a static artifact "
-                "has one place in photos of one orientation",
-                "process one of them, or remove the tag from all photos",
-            )
-        raise InputError(
-            f"{photo} is {other[0][0]} x {other[0][1]}, {photos[0].name} is {size[0]} x {size[1]}",
-            f"use one folder for each camera and orientation, or remove {counted(len(groups[other]), 'photo')} like it",
-        )
-    return _of_photos(name, path, photos, (size, orientation), videos)
+    if len(groups) > 1:
+        raise _mixed(groups, min_photos)
+    (frame,) = groups
+    return _of_photos(name, path, photos, frame, videos)
 
 
 _Frame = tuple[tuple[int, int], int]
@@ -201,6 +194,26 @@ def _by_frame(photos: list[Path]) -> dict[_Frame, list[Path]]:
         with open_photo(photo) as image:
             groups.setdefault((image.size, exif_orientation(image)), []).append(photo)
     return groups
+
+
+def _mixed(groups: dict[_Frame, list[Path]], min_photos: int) -> InputError:
+    """Names the photos of the frames that too few share, or else of the rarest one, as those that do not belong."""
+    usual, *others = sorted(groups, key=lambda frame: -len(groups[frame]))
+    rare = [frame for frame in others if len(groups[frame]) < min_photos] or others[-1:]
+    odd = [photo for frame in rare for photo in groups[frame]]
+    (size, orientation), photo, like = rare[0], odd[0], groups[usual][0].name
+    those = name_list([each.name for each in odd]) if len(odd) <= _NAMED else f"{counted(len(odd), 'photo')} like it"
+    if size != usual[0]:
+        remedies = [f"remove {those}", "use one folder for each camera and orientation"]
+        return InputError(
+            f"{photo} is {size[0]} x {size[1]}, {like} is {usual[0][0]} x {usual[0][1]}",
+            ", or ".join(remedies if len(odd) < min_photos else reversed(remedies)),
+        )
+    return InputError(
+        f"{photo} has EXIF orientation {orientation}, {like} has {usual[1]}: a static artifact has one place in photos "
+        "of one orientation",
+        f"remove {those}, or the tag from all photos",
+    )
 
 
 def _called(frames: Iterable[_Frame]) -> list[str]:

@@ -97,7 +97,7 @@ def test_what_one_camera_cannot_have_taken_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"holds 2 photos, 3 are needed; add more"):
         read_source(tmp_path, "frame", min_photos=3)
     Image.new("RGB", (48, 64)).save(tmp_path / "2.png")
-    with pytest.raises(InputError, match=r"2.png is 48 x 64, 0.png is 64 x 48; use one folder for each camera"):
+    with pytest.raises(InputError, match=r"2.png is 48 x 64, 0.png is 64 x 48; remove 2.png, or use one folder for"):
         read_source(tmp_path, "frame", min_photos=3)
 
 
@@ -127,6 +127,22 @@ def test_photos_in_portrait_and_landscape_are_two_cameras(tmp_path):
     (tmp_path / "6.png").unlink()
     with pytest.raises(InputError, match=r"4.png has EXIF orientation 6, 0.png has 1"):
         read_sources(tmp_path, "frame", min_photos=3)
+
+
+def test_the_photos_that_do_not_belong_are_named_not_another_camera(tmp_path):
+    touch_photos(tmp_path, *(f"{number}.png" for number in (1, 4, 5, 6)))
+    sizes = {0: (30, 70), 2: (48, 64), 3: (48, 64), 7: (48, 64), 8: (31, 70)}
+    for number, size in sizes.items():
+        Image.new("RGB", size).save(tmp_path / f"{number}.png")
+    with pytest.raises(InputError, match=r"0.png is 30 x 70, 1.png is 64 x 48; remove 0.png, 8.png, or"):
+        read_sources(tmp_path, "frame", min_photos=3)
+    for number in (0, 8):
+        (tmp_path / f"{number}.png").unlink()
+    assert len(read_sources(tmp_path, "frame", min_photos=3)) == 2
+    with pytest.raises(
+        InputError, match=r"2.png is 48 x 64, 1.png is 64 x 48; use one .*, or remove 2.png, 3.png, 7.png"
+    ):
+        read_source(tmp_path, "front", min_photos=3)
 
 
 @pytest.mark.parametrize(
