@@ -78,6 +78,7 @@ class Choices:
         """
         photos, data = (os.path.relpath(path, output) for path in (self.photos, self.data(output)))
         run = ["--load-config", os.path.relpath(config, output.resolve())]
+        masked_by = run if evaluation.has_overlay else ["--data", data]  # without an overlay by detection
         whole = [] if read_panorama(Transforms.read(self.data(output))) is None else ["--equirectangular"]
         stages = {
             "Look at the splats": ["ns-viewer", *run],
@@ -87,7 +88,7 @@ class Choices:
             "Evaluate": ["ns-eval", *run, "--output-path", "again/evaluation.json"],
             "Splats": ["ssa", "export-splats", *run, "--output-dir", "again", "--compressed"],
             "For Brush (or nerfstudio, COLMAP, LichtFeld Studio, 3DGRUT, Postshot)": [
-                *("ssa", "export-dataset", "--for", "brush", *run, "--output", "again/capture")
+                *("ssa", "export-dataset", "--for", "brush", *masked_by, "--output", "again/capture")
             ],
             "Artifact, masks, layers": ["ssa", "export-overlay", *run, "--output", "again/artifact", *whole],
         }
@@ -95,6 +96,8 @@ class Choices:
             del stages["Poses"]
         if not evaluation.views:
             del stages["Evaluate"]
+        if not evaluation.has_overlay:
+            del stages["Artifact, masks, layers"]
         return {name: shlex.join(words) for name, words in stages.items()}
 
     def _training(self) -> list[str]:

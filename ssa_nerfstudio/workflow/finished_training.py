@@ -45,6 +45,18 @@ class Evaluation:
     """See `Transforms.test_photos_are_clean`."""
     pictured: list[PicturedGroup] = field(default_factory=list)
     """What `write_view_pictures` shows, in its order."""
+    detected: bool = False
+    """Whether detection found an artifact in the photos of a camera, before the training."""
+
+    @property
+    def has_overlay(self) -> bool:
+        """Whether the training learned the artifact of a camera."""
+        return any(group.overlay is not None for group in self.pictured)
+
+    @property
+    def carried(self) -> bool:
+        """Whether test photos carry an artifact, so that the clean render differs from them however good it is."""
+        return not self.clean_test_views and (self.detected or self.has_overlay)
 
     @staticmethod
     def read(folder: Path) -> Evaluation:
@@ -58,12 +70,13 @@ class Evaluation:
 
 
 @torch.no_grad()
-def evaluate(pipeline: SSAPipeline, data: Path, on_progress: ProgressCallback) -> Evaluation:
+def evaluate(pipeline: SSAPipeline, data: Path, detected: bool, on_progress: ProgressCallback) -> Evaluation:
     """Compare the clean render, and with an overlay the composite, with every test photo.
 
     Args:
         pipeline: a trained one, with its test views.
         data: its dataset.
+        detected: whether detection found an artifact in its photos.
         on_progress: called after every view.
     """
     names = pipeline.datamanager.photo_names(pipeline.datamanager.eval_dataset)
@@ -74,7 +87,7 @@ def evaluate(pipeline: SSAPipeline, data: Path, on_progress: ProgressCallback) -
         on_progress("test view", len(views), len(names))
     keys = next(iter(views.values()), {})
     means = {key: sum(view[key] for view in views.values()) / len(views) for key in keys}
-    return Evaluation(means, views, Transforms.read(data).test_photos_are_clean, _pictured(pipeline))
+    return Evaluation(means, views, Transforms.read(data).test_photos_are_clean, _pictured(pipeline), detected)
 
 
 def _pictured(pipeline: SSAPipeline) -> list[PicturedGroup]:

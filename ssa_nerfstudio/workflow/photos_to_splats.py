@@ -218,7 +218,8 @@ def _verdicts(plan: Plan) -> dict[str, str]:
 
 def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:
     pipeline = load_trained(plan.training)
-    evaluation = evaluate(pipeline, plan.data, on_progress)
+    found = any(verdict != "none" for verdict in _verdicts(plan).values())
+    evaluation = evaluate(pipeline, plan.data, found, on_progress)
     with _emptied(plan.output / EVALUATION) as staged:
         evaluation.write(staged)
         write_view_pictures(pipeline, staged)
@@ -230,11 +231,12 @@ def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:
         return Result(
             f"nothing to measure on: all {trained} photos were trained on; of ten or more, one in ten is left to test"
         )
-    views = f"PSNR of {number} photo{'s' * (number > 1)} that the training did not see:"
-    if evaluation.clean_test_views or "composite_psnr" not in metrics:
+    views = f"PSNR of {counted(number, 'photo')} that the training did not see:"
+    if not evaluation.carried:
         return Result(f"{views} {metrics['psnr']:.1f} dB")
-    # The clean render differs from them by the artifact, however good it is.
-    return Result(f"{views} {metrics['composite_psnr']:.1f} dB, with the artifact that they have")
+    if evaluation.has_overlay:
+        return Result(f"{views} {metrics['composite_psnr']:.1f} dB, with the artifact that they have")
+    return Result(f"{views} {metrics['psnr']:.1f} dB; they have the artifact that was found, which was not learned")
 
 
 def _export(plan: Plan, on_progress: ProgressCallback) -> Result:

@@ -62,7 +62,8 @@ def report_page(
         cameras=cameras,
         sphere=sphere,
         figures=_figures(evaluation, exposed),
-        carried=not evaluation.clean_test_views and "composite_psnr" in evaluation.metrics,
+        carried=evaluation.carried,
+        overlay=evaluation.has_overlay,
         found={stage.name: stage.text for stage in stages},
         decisions=[decision for stage in stages for decision in stage.decisions],
         stages=[(stage.name, str(timedelta(seconds=round(stage.seconds))), stage.text) for stage in stages],
@@ -100,16 +101,19 @@ def _figures(evaluation: Evaluation, exposed: bool) -> list[tuple[str, str, str]
     if not metrics:
         return []
     rows, corrected = [], []
-    if "composite_psnr" in metrics and not evaluation.clean_test_views:
+    best = [f"splats alone; {best}" for best in ("higher is better", "1 is best", "0 is best")]
+    if evaluation.carried:
+        best = ["splats alone, against photos with the artifact"] * 3
+    if evaluation.carried and evaluation.has_overlay:
         value = f"{metrics['composite_psnr']:.2f} dB"
-        rows.append(("PSNR with the artifact", value, "splats and artifact, as the photos are"))
+        rows.append(("PSNR with the artifact", value, "splats and artifact, as the photos are; higher is better"))
     if exposed and "cc_psnr" in metrics:
         meaning = "splats alone, brought to the exposure of each photo, which is not known"
         corrected.append(("Color-corrected PSNR", f"{metrics['cc_psnr']:.2f} dB", meaning))
     return [
         *rows,
-        ("PSNR", f"{metrics['psnr']:.2f} dB", "splats alone; higher is better"),
+        ("PSNR", f"{metrics['psnr']:.2f} dB", best[0]),
         *corrected,
-        ("SSIM", f"{metrics['ssim']:.3f}", "splats alone; 1 is best"),
-        ("FLIP", f"{metrics['flip']:.3f}", "splats alone; 0 is best"),
+        ("SSIM", f"{metrics['ssim']:.3f}", best[1]),
+        ("FLIP", f"{metrics['flip']:.3f}", best[2]),
     ]

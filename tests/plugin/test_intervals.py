@@ -152,7 +152,7 @@ def test_one_that_is_replaced_has_an_overlay_for_each_interval(half, tmp_path, c
     trainer.pipeline.eval()
     write_view_pictures(trainer.pipeline, tmp_path)
     assert {path.name for path in tmp_path.glob("photo-*.jpg")} == {"photo-1.jpg", "photo-2.jpg"}
-    assert evaluate(trainer.pipeline, scene, lambda *_: None).pictured == [
+    assert evaluate(trainer.pipeline, scene, True, lambda *_: None).pictured == [
         PicturedGroup("from the first photo", "interval_1"),
         PicturedGroup(f"from {Path(artifacts.starts[1]).name}", "interval_2"),
     ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import shlex
 import shutil
 from pathlib import Path
@@ -41,3 +42,13 @@ def test_a_run_without_test_photos_offers_no_evaluation(tiny_scene, tmp_path):
     choices, config = Choices(tiny_scene, "ssa-splatfacto", 120, 1.0), tmp_path / "training/config.yml"
     assert "Evaluate" in choices.commands(tmp_path, config, evaluation())
     assert "Evaluate" not in choices.commands(tmp_path, config, evaluation(tested=False))
+
+
+def test_a_run_without_an_overlay_offers_nothing_that_needs_one(tiny_scene, tmp_path):
+    choices, config = Choices(tiny_scene, "ssa-splatfacto", 120, 1.0), tmp_path / "training/config.yml"
+    learned, alone = (choices.commands(tmp_path, config, evaluation(overlay=overlay)) for overlay in (True, False))
+    (overlay,) = learned.keys() - alone.keys()
+    assert "export-overlay" in learned[overlay]
+    (capture,) = (command for command in alone.values() if "export-dataset" in command)
+    assert "--load-config" not in capture
+    assert str(os.path.relpath(tiny_scene, tmp_path)) in capture

@@ -87,3 +87,14 @@ def test_the_composite_is_compared_with_photos_that_carry_the_artifact_alone(tmp
     page = report_page(tmp_path, "drive", STAGES, {})
     assert ("14.77 dB" in page) != clean
     assert ("They carry the artifact" in page) != clean
+    assert ("higher is better" in page[page.index("<td>PSNR</td>") :]) == clean
+
+
+@pytest.mark.parametrize("detected", [True, False])
+def test_photos_with_an_artifact_that_was_not_learned_do_not_judge_the_splats(tmp_path, detected):
+    page_of(tmp_path, [None], [])
+    evaluation = replace(Evaluation.read(tmp_path / "evaluation"), clean_test_views=False, detected=detected)
+    evaluation.write(tmp_path / "evaluation")
+    page = report_page(tmp_path, "drive", STAGES, {})
+    assert ("splats that show the artifact get better figures" in page) == detected
+    assert ("higher is better" in page) != detected
