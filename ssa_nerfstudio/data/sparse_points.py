@@ -1,4 +1,4 @@
-"""The sparse points of a dataset: written, and refused where a training would start from something else."""
+"""The sparse points of a dataset: written, read, and refused where a training would start from something else."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-_NEEDED = {"x", "y", "z", "red", "green", "blue"}
+_NEEDED = ("x", "y", "z", "red", "green", "blue")
 
 
 def write_points(path: Path, points: np.ndarray, colors: np.ndarray) -> None:
@@ -43,7 +43,16 @@ def check_points(path: Path) -> None:
     cut off.
 
     Raises:
-        InputError: the file is missing, no PLY, empty or truncated, a coordinate is no number, or no point is finite.
+        InputError: see `read_points`.
+    """
+    read_points(path)
+
+
+def read_points(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read positions [N, 3], of which single ones may not be finite, and colors uint8 [N, 3] from a PLY file.
+
+    Raises:
+        InputError: the file is missing, no PLY, empty or truncated, a value is no number, or no point is finite.
     """
     try:
         refuse_pipe(path)
@@ -56,30 +65,32 @@ def check_points(path: Path) -> None:
                 raise ValueError("its header is not that of a PLY file that starts with vertices")
             if count < 1:
                 raise ValueError("it holds no points")
-            if missing := sorted(_NEEDED - properties.keys()):
+            if missing := sorted({*_NEEDED} - properties.keys()):
                 raise ValueError(f"its points have no {', '.join(missing)}")
-            points = _coordinates(file, kind, count, properties)
-            if len(points) < count:
-                raise ValueError(f"it holds {len(points)} of the {count} points that it states")
+            table = _columns(file, kind, count, properties)
+            if len(table) < count:
+                raise ValueError(f"it holds {len(table)} of the {count} points that it states")
+            points, colors = table[:, :3], table[:, 3:]
             if not np.isfinite(points).all(axis=1).any():  # a training leaves single ones out
                 raise ValueError(f"none of its {count} points is finite")
+            return points, colors.astype(np.uint8)
     except (OSError, ValueError) as error:
         reason = (isinstance(error, OSError) and error.strerror) or error
         raise InputError(f"{path} cannot be read as sparse points ({reason})", _REMEDY) from error
 
 
-def _coordinates(file: BinaryIO, kind: str, count: int, properties: dict[str, str]) -> np.ndarray:
-    """Read x, y, z [N, 3] of up to `count` vertices; ValueError where one is no number."""
+def _columns(file: BinaryIO, kind: str, count: int, properties: dict[str, str]) -> np.ndarray:
+    """Read place and color [N, 6] of up to `count` vertices; ValueError where a value is no number."""
     if kind == "ascii":
-        places = [list(properties).index(axis) for axis in "xyz"]
+        places = [list(properties).index(axis) for axis in _NEEDED]
         rows = (line.split() for line, _ in zip(file, range(count), strict=False))
         rows = [[float(row[place]) for place in places] for row in rows if len(row) >= len(properties)]
-        return np.array(rows, dtype=np.float64).reshape(-1, 3)
+        return np.array(rows, dtype=np.float64).reshape(-1, len(_NEEDED))
     order = ">" if "big" in kind else "<"
     kinds = np.dtype([(name, f"{order}{kind}") for name, kind in properties.items()])
     whole = min(count, (os.fstat(file.fileno()).st_size - file.tell()) // kinds.itemsize)
     table = np.frombuffer(file.read(whole * kinds.itemsize), kinds)
-    return np.stack([table[axis] for axis in "xyz"], axis=1)
+    return np.stack([table[axis].astype(np.float64) for axis in _NEEDED], axis=1)
 
 
 def _vertices(header: list[str]) -> tuple[str, int, dict[str, str]]:

@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
 from ssa_nerfstudio.cameras.lens import Lens
-from ssa_nerfstudio.data.sparse_points import check_points
+from ssa_nerfstudio.data.sparse_points import read_points
 from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.training.nonfinite import finite_points
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -32,7 +34,8 @@ class PosedPhoto:
 def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[str, Any], points: Path | None) -> int:
     """Write cameras.bin, images.bin, points3D.bin, and the rigs and frames of COLMAP 4.
 
-    The points have no tracks. Everything is in COLMAP's world, where `applied_transform` has been undone.
+    The points have no tracks; those that are not finite are left out, as by a training. Everything is in COLMAP's
+    world, where `applied_transform` has been undone.
 
     Args:
         folder: the model's; made where missing.
@@ -63,12 +66,11 @@ def write_colmap_model(folder: Path, photos: Sequence[PosedPhoto], meta: dict[st
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(world_to_camera[:3]))
     count = 0
     if points is not None:
-        check_points(points)  # COLMAP's reader takes what is cut off for points
-        cloud = pycolmap.Reconstruction()
-        cloud.import_PLY(points)
-        for point in cloud.points3D.values():
-            model.add_point3D(to_colmap[:3, :3] @ point.xyz + to_colmap[:3, 3], pycolmap.Track(), point.color)
-        count = len(cloud.points3D)
+        places, colors = map(torch.from_numpy, read_points(points))
+        finite = finite_points((places, colors))
+        for place, color in zip(*finite, strict=True) if finite else ():
+            model.add_point3D(to_colmap[:3, :3] @ place.numpy() + to_colmap[:3, 3], pycolmap.Track(), color.numpy())
+        count = model.num_points3D()
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)
     return count

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -172,6 +173,17 @@ def test_the_model_holds_the_cameras_of_the_dataset(rig, tmp_path, program):
     found = {tuple(point.color): applied[:3, :3] @ point.xyz + applied[:3, 3] for point in model.points3D.values()}
     np.testing.assert_allclose(found[10, 20, 30], [0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(found[200, 100, 50], [1, 2, 3], atol=1e-6)
+
+
+def test_points_that_are_not_finite_are_left_out_of_the_model_as_of_a_training(rig, tmp_path, caplog):
+    broken = Path(shutil.copytree(rig, tmp_path / "rig"))
+    points = (broken / "sparse_pc.ply").read_text().replace("vertex 2", "vertex 4")
+    (broken / "sparse_pc.ply").write_text(points + "nan 1 2 1 2 3\n3 inf 1 4 5 6\n")
+    folder = export(broken, tmp_path / "out", "colmap")
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    assert sorted(tuple(point.color) for point in model.points3D.values()) == [(10, 20, 30), (200, 100, 50)]
+    assert all(np.isfinite(point.xyz).all() for point in model.points3D.values())
+    assert "2 of the dataset's 4 3D points are not finite" in caplog.text
 
 
 @pytest.mark.parametrize("program", sorted(MASKS))
