@@ -137,8 +137,8 @@ def choose_length_and_scale(longest: int, steps: int | None) -> tuple[int, float
     if scale == 1 and steps is not None:
         return steps, scale, ()
     text = (
-        f"trained without a GPU, for {counted(steps or CPU_STEPS, 'step')} on photos of at most "
-        f"{round(scale * trained)} pixels; with one, the same command trains {STEPS:,} steps on all pixels, which is "
+        f"without a GPU, training takes {counted(steps or CPU_STEPS, 'step')} on photos of at most "
+        f"{round(scale * trained)} pixels; with one, the same command takes {STEPS:,} steps on all pixels, which is "
         "sharper"
     )
     return steps or CPU_STEPS, scale, (text,)

@@ -72,7 +72,7 @@ class Plan:
     choices: dict[str, dict[str, Any]]
     """What each of the first three stages was asked for, for the record."""
     training_warnings: tuple[str, ...] = ()
-    """What the user should know about that training."""
+    """What the user should know about that training before it starts."""
 
 
 def stages(plan: Plan) -> list[Stage]:
@@ -129,10 +129,9 @@ def _detect(plan: Plan, on_progress: ProgressCallback) -> Result:
             f"a small or faint artifact in the photos{of} may have been missed; if you see one there, add "
             "--train.pipeline.model.overlay on"
         )
-    if any(detection.verdict == "none" for detection in found.values()):
-        warnings.append(
-            "a soft artifact has no edges; training looks again, with the scene's points, and says what it found"
-        )
+    looked_at_again = plan.training.pipeline.model.overlay == "auto"
+    if looked_at_again and any(detection.verdict == "none" for detection in found.values()):
+        _LOG.info("A soft artifact has no edges; training looks again, with the scene's points, and tells.")
     return Result("; ".join(sentences) if len(found) > 1 else verdict_in_words(*found.values()), tuple(warnings))
 
 
@@ -162,6 +161,8 @@ def _process(
 
 
 def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
+    for warning in plan.training_warnings:
+        _LOG.warning(warning)
     began = train(plan.training, on_progress, partial(warn_of_missed_artifacts, plan))
     _free_memory()
     checkpoint = Checkpoint.read(config_file(plan.training))
@@ -172,7 +173,7 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
     return Result(
         f"{text}, in {counted(checkpoint.step + 1, 'step')}{resumed}",
-        (*plan.training_warnings, *clear_overlays(layers)),
+        tuple(clear_overlays(layers)),
     )
 
 

@@ -128,7 +128,7 @@ def test_the_page_shows_all_and_names_no_folder_of_this_machine(finished):
     assert "a static artifact over" in page
     assert 'href="splats.ply"' in page
     assert "They carry the artifact, too" in page
-    assert "trained without a GPU" not in page, "120 steps were asked for, and the photos are small"
+    assert "without a GPU" not in page, "120 steps were asked for, and the photos are small"
 
 
 def test_the_commands_on_the_page_work_in_its_folder(finished):
