@@ -9,6 +9,9 @@ from pathlib import PurePosixPath
 
 from ssa_nerfstudio.cameras.intervals import capture_order
 
+_BEFORE_NUMBER = r"[_\-. ]*"
+"""What separates a photo's number from what comes before it."""
+
 
 def camera_names(photos: Sequence[Sequence[str]]) -> list[str]:
     """What the names of each camera's photos begin with, as in front_0001.jpg or images/front/1.jpg: "front".
@@ -29,6 +32,15 @@ def camera_names(photos: Sequence[Sequence[str]]) -> list[str]:
     return [f"camera_{number}" for number in range(len(photos))]
 
 
+def camera_of_folder(folder: str) -> str:
+    """What the camera is called whose photos are in a folder of this name.
+
+    The dataset's photos are called by it, so that `camera_names` finds it before their numbers.
+    """
+    name = re.sub(r"[^\w.-]", "_", folder)
+    return re.sub(rf"{_BEFORE_NUMBER}$", "", name) or name
+
+
 def _folder(photos: Sequence[str]) -> str:
     """Folder of all photos below the dataset's images/ or images_2/; empty where there is none."""
     folders = {"_".join(PurePosixPath(photo).parts[1:-1]) for photo in photos}
@@ -37,7 +49,7 @@ def _folder(photos: Sequence[str]) -> str:
 
 def _before_number(photos: Sequence[str]) -> str:
     """What all file names have before the number that counts the photos; empty where they differ."""
-    beginnings = {re.sub(r"[_\-. ]*\d+$", "", PurePosixPath(photo).stem) for photo in photos}
+    beginnings = {re.sub(rf"{_BEFORE_NUMBER}\d+$", "", PurePosixPath(photo).stem) for photo in photos}
     return beginnings.pop() if len(beginnings) == 1 else ""
 
 

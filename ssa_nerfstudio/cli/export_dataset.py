@@ -76,7 +76,8 @@ class Command:
         left = sum(photo.left for photo in photos) / len(photos)
         console.print(
             f"{self.output}: {counted(len(photos), 'photo')} for {export.preset.title}, {export.frame} frame; "
-            f"{left:.1%} of their pixels are left, of the least {min(photo.left for photo in photos):.1%}"
+            f"on average {left:.1%} of a photo is not masked, of the one with the largest mask "
+            f"{min(photo.left for photo in photos):.1%}"
         )
         console.print(f"There: {export.preset.start}")
 

@@ -119,7 +119,9 @@ class Command:
         if self.mask is not None and len(sources) > 1:
             raise InputError(
                 f"{self.train} holds the photos of {len(sources)} cameras, --mask is one camera's",
-                "use --detect, or process the cameras one by one",
+                "leave it out, as --detect masks each camera's own artifact"
+                if self.detect
+                else "use --detect, or process the cameras one by one",
             )
         mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
         model = "OPENCV_FISHEYE" if self.projection == "fisheye" else "OPENCV"

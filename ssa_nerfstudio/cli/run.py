@@ -67,9 +67,11 @@ class Command:
             for name in (word[2:].partition("=")[0].replace("_", "-") for word in words if word.startswith("--")):
                 if name in _ITS_OWN[stage]:
                     raise InputError(f"--{stage}.{name} is set by ssa run", f"use {_ITS_OWN[stage][name]}")
-        files = [word for word in own if not word.startswith("-") and Path(word).is_file()]
-        if len(files) > 1:
-            raise InputError(f"PHOTOS is one folder or video, not {len(files)} files", f"give {Path(files[0]).parent}")
+        values = {number + 1 for number, word in enumerate(own) if word.startswith("--") and "=" not in word}
+        paths = [Path(word) for number, word in enumerate(own) if number not in values and Path(word).exists()]
+        if len(paths) > 1:
+            kind, one = ("folders", ", whose subfolders are its cameras") if paths[0].is_dir() else ("files", "")
+            raise InputError(f"PHOTOS is one folder or video, not {len(paths)} {kind}", f"give {paths[0].parent}{one}")
         if "--photos" in own:
             raise InputError("PHOTOS has no option's name", "ssa run PHOTOS --output OUT")
         _, _, forwarding = (inspect.getdoc(cls) or "").partition("\n\n")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from PIL import ExifTags, Image, ImageOps
 
+from ssa_nerfstudio._system.named_pipes import refuse_pipe
 from ssa_nerfstudio.errors import InputError
 
 HEIF_SUFFIXES = {".heic", ".heif"}
@@ -41,9 +42,8 @@ def open_photo(path: Path, modes: Collection[str] = ("RGB", "L", "RGBA")) -> Ite
     """
     if path.suffix.lower() in HEIF_SUFFIXES:
         _register_heif(path)
-    if path.is_fifo():
-        raise InputError(f"{path} is a pipe, no photo", "put a file there or remove it")  # opening it waits for ever
     try:
+        refuse_pipe(path)
         with Image.open(path) as image:
             if image.mode not in modes:
                 kind = "RGB" if "RGB" in modes else "gray"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -14,6 +13,7 @@ import numpy as np
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio._system.natural_order import natural_order
+from ssa_nerfstudio.cameras.camera_names import camera_of_folder
 from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.photos import UPRIGHT, exif_orientation, open_photo
 from ssa_nerfstudio.data.transforms import is_file
@@ -117,7 +117,7 @@ def read_sources(path: Path, name: str, min_photos: int) -> list[Source]:
     if path.is_dir() and not any(_media(path)):
         folders = [folder for folder in sorted(path.iterdir(), key=_by_name) if _is_camera(folder)]
         if folders:
-            sources = [read_source(folder, re.sub(r"[^\w.-]", "_", folder.name), min_photos) for folder in folders]
+            sources = [read_source(folder, camera_of_folder(folder.name), min_photos) for folder in folders]
             for number, source in enumerate(sources):
                 if source.name in {other.name for other in sources[:number]}:
                     raise InputError(f"{source.path} has the name of another camera", "rename it")

@@ -213,8 +213,9 @@ class DatasetExport:
             f"# {counted(len(photos), 'photo')} for {self.preset.title}\n\n    {self.preset.start}\n\n"
             f"{self.preset.note}\n\n"
             f"Here are {kind}, in the {self.frame} frame. {masked} White is used, black is ignored.\n{without}\n"
-            f"Of the photos {np.mean(left):.1%} is left, of the least {min(left):.1%}.\n\n"
-            f"| photo | left |\n|---|---|\n{rows}\n\nThe layout follows:\n\n{sources}\n"
+            f"On average {np.mean(left):.1%} of a photo is not masked, of the one with the largest mask "
+            f"{min(left):.1%}.\n\n"
+            f"| photo | not masked |\n|---|---|\n{rows}\n\nThe layout follows:\n\n{sources}\n"
         )
 
 

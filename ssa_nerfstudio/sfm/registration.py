@@ -88,8 +88,8 @@ def check_registrations(
             elif masked_by == "user":
                 remedy = f"look whether the mask is black on the artifact (else --invert-mask), or {remedy}"
             raise InputError(
-                f"only {each.count} of {each.photos} {each.name} photos could be registered, {min_share:.0%} are "
-                "required",
+                f"only {each.count} of {_photos_of(each.name, passes, f'{each.photos} photos')} could be registered, "
+                f"{min_share:.0%} are required",
                 remedy,
             )
 
@@ -104,7 +104,7 @@ def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
     Raises:
         InputError: one cannot.
     """
-    for number in sorted({image.camera_id for image in model.images.values() if image.has_pose}):
+    for number in map(int, sorted({image.camera_id for image in model.images.values() if image.has_pose})):
         camera = model.cameras[number]
         fx, fy, cx, cy, k1, k2, *others = map(float, camera.params)
         fisheye = camera.model.name == "OPENCV_FISHEYE"
@@ -114,16 +114,21 @@ def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
             undistorted_lens(Lens(*size, fx, fy, cx, cy, distortion, kind))
         except InputError as error:
             raise InputError(
-                f"the lens that structure from motion estimates for the {names[number - 1]} photos is none "
+                f"the lens that structure from motion estimates for {_photos_of(names[number - 1], names)} is none "
                 f"(k1 = {k1:.2g}, k2 = {k2:.2g}): their poses are wrong",
                 "take photos from more directions, that overlap more",
             ) from error
         if aspect(camera) > MAX_ASPECT:
             _LOG.warning(
-                f"the lens that structure from motion estimates for the {names[number - 1]} photos would have pixels "
-                f"of {aspect(camera):.1f}:1 (focal lengths {fx:.0f} and {fy:.0f}): their poses are likely wrong; mask "
-                "what covers part of every frame, or take photos from more directions"
+                f"the lens that structure from motion estimates for {_photos_of(names[number - 1], names)} would have "
+                f"pixels of {aspect(camera):.1f}:1 (focal lengths {fx:.0f} and {fy:.0f}): their poses are likely "
+                "wrong; mask what covers part of every frame, or take photos from more directions"
             )
+
+
+def _photos_of(name: str, passes: Sequence[object], photos: str = "the photos") -> str:
+    """The photos of a pass, which is named where there are several."""
+    return f"{photos} of {name}" if len(passes) > 1 else photos
 
 
 def warn_of_equal_cameras(model: pycolmap.Reconstruction, names: Sequence[str]) -> None:

@@ -102,12 +102,12 @@ def detect_with_progress(
     """`evidence.capture_detection.detect_camera` of each camera, by its name."""
     total, done = sum(camera.count for camera in cameras), count(1)
 
-    def counted(camera: Camera, threads: int) -> Iterator[np.ndarray]:
+    def shown(camera: Camera, threads: int) -> Iterator[np.ndarray]:
         for photo in camera.photos(threads):
             yield photo
             on_progress("photo", min(next(done), total), total)
 
-    streams = [replace(camera, photos=partial(counted, camera)) for camera in cameras]
+    streams = [replace(camera, photos=partial(shown, camera)) for camera in cameras]
     return {camera.name: detect_camera(camera, threads, draws=draws) for camera in streams}
 
 
@@ -167,9 +167,13 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     _free_memory()
     checkpoint = Checkpoint.read(config_file(plan.training))
     layers = _layers(checkpoint)
-    overlays, kind = len(layers), "intervals" if any(layer.start != BEGINNING for layer in layers) else "cameras"
+    overlays, several = len(layers), f"the artifacts of {len(layers)} cameras were"
+    if any(layer.start != BEGINNING for layer in layers):
+        several = f"the artifacts of {overlays} intervals were"
+    elif read_panorama(Transforms.read(plan.data)) is not None:
+        several = f"the artifact in {overlays} faces of the panoramas was"
     decided = {0: "the scene alone was learned", 1: "the artifact was learned with the scene"}
-    text = decided.get(overlays, f"the artifacts of {overlays} {kind} were learned with the scene")
+    text = decided.get(overlays, f"{several} learned with the scene")
     resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
     return Result(
         f"{text}, in {counted(checkpoint.step + 1, 'step')}{resumed}",

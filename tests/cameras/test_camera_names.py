@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ssa_nerfstudio.cameras.camera_names import camera_names
+from ssa_nerfstudio.cameras.camera_names import camera_names, camera_of_folder
 
 
 @pytest.mark.parametrize(
@@ -29,3 +29,10 @@ from ssa_nerfstudio.cameras.camera_names import camera_names
 )  # fmt: skip
 def test_a_camera_is_called_what_its_photos_have_in_common(photos, names):
     assert camera_names(photos) == names
+
+
+@pytest.mark.parametrize("folder", ["front", "Cam #1 [front]", "side-2", "seite ä.", "cam 1 "])
+def test_a_camera_of_a_folder_is_called_the_same_before_and_after_its_photos_are(folder):
+    name = camera_of_folder(folder)
+    photos = [[f"images/{each}_{number:05d}.jpg" for number in (1, 2)] for each in (name, "other")]
+    assert camera_names(photos) == [name, "other"]

@@ -247,8 +247,8 @@ def test_the_page_in_the_folder_has_the_command_and_what_is_left(rig, tmp_path, 
     for camera in LENSES:
         assert f"| {camera}/view_2.png | {shares[camera]} |" in page
     least = min(shares.values(), key=lambda share: float(share[:-1]))
-    assert f"of the least {least}" in page
-    assert f"of the least {least}" in capsys.readouterr().out
+    assert f"of the one with the largest mask {least}" in page
+    assert f"of the one with the largest mask {least}" in capsys.readouterr().out
     assert str(tmp_path) not in page
 
 

@@ -103,7 +103,7 @@ def test_photos_that_show_nothing_in_common_stop_the_command(tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["process", "--train", str(tmp_path / "photos"), "--output", str(tmp_path / "out"), "--threads", "1"])
     (line,) = capsys.readouterr().err.splitlines()
-    assert "only 0 of 4 frame photos could be registered, 50% are required" in line
+    assert "only 0 of 4 photos could be registered, 50% are required" in line
     assert sorted(path.name for path in tmp_path.iterdir()) == [".out.work", "photos"]
 
 

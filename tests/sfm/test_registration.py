@@ -30,7 +30,7 @@ def model(*lenses: list[float]) -> pycolmap.Reconstruction:
 def test_a_lens_that_no_camera_has_is_refused_by_its_name():
     """Its values are those of a drive straight ahead, of which half of the photos registered."""
     check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [0.1, 0, 0.001, 0]))
-    with pytest.raises(InputError, match=r"for the side photos is none \(k1 = 2, k2 = -0.21\)"):
+    with pytest.raises(InputError, match=r"for the photos of side is none \(k1 = 2, k2 = -0.21\)"):
         check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [6231.8, 247.9, 2.0042, -0.2101, -0.5735, 0.4871]))
 
 
@@ -38,10 +38,10 @@ def test_pixels_that_no_camera_has_are_warned_of_by_its_name(caplog):
     check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [800, 700, 0.1, 0, 0, 0]))
     assert not caplog.records
     check_lenses(["front", "side"], model([-0.2, 0.05, 0, 0], [1000, 700, 0.1, 0, 0, 0]))
-    assert "for the side photos would have pixels of 1.4:1 (focal lengths 1000 and 700)" in caplog.text
+    assert "for the photos of side would have pixels of 1.4:1 (focal lengths 1000 and 700)" in caplog.text
     caplog.clear()
     check_lenses(["front", "side"], model([500, 700, 0.1, 0, 0, 0], [-0.2, 0.05, 0, 0]))
-    assert "for the front photos would have pixels of 1.4:1" in caplog.text
+    assert "for the photos of front would have pixels of 1.4:1" in caplog.text
 
 
 def test_cameras_that_training_takes_for_one_are_named(caplog):
@@ -62,5 +62,5 @@ def test_cameras_that_training_takes_for_one_are_named(caplog):
 def test_the_remedy_of_few_poses_depends_on_whose_mask_it_is(masked_by, remedy):
     few = [PassRegistration("front", 4, ("2.png", "3.png", "4.png"))]
     check_registrations(few, 0.25, masked_by)
-    with pytest.raises(InputError, match=f"only 1 of 4 front photos .*{remedy}"):
+    with pytest.raises(InputError, match=f"only 1 of 4 photos .*{remedy}"):
         check_registrations(few, 0.5, masked_by)

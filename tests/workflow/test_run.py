@@ -218,12 +218,6 @@ def test_wrong_options_end_before_any_work(tiny_scene, tmp_path, capsys, options
     assert not (tmp_path / "out").exists()
 
 
-def test_a_list_of_photos_is_answered_with_their_folder(tiny_scene, tmp_path, capsys):
-    with pytest.raises(SystemExit):
-        run(*sorted((tiny_scene / "images").iterdir()), "--output", tmp_path / "out")
-    assert f"give {tiny_scene / 'images'}" in capsys.readouterr().err
-
-
 def test_its_help_says_that_options_of_the_stages_are_passed_on(capsys):
     with pytest.raises(SystemExit) as caught:
         run("--help")

@@ -162,10 +162,6 @@ def belongs(effect: str, kind: str) -> bool:
     return category(effect) == kind or (kind == MEAN and effect != CLEAN)
 
 
-def _position(name: str) -> int:
-    return CATEGORY_ORDER.index(name) if name in CATEGORY_ORDER else len(CATEGORY_ORDER)
-
-
 def lead(study: Study, effect: str, scene: str, densification: str) -> float | None:
     """PSNR of the default minus the better of paper's rule and oracle, dB; None where one side was not trained."""
     ours, *references = (
@@ -173,3 +169,7 @@ def lead(study: Study, effect: str, scene: str, densification: str) -> float | N
     )
     known = finite(references)
     return None if ours is None or not known else ours - max(known)
+
+
+def _position(name: str) -> int:
+    return CATEGORY_ORDER.index(name) if name in CATEGORY_ORDER else len(CATEGORY_ORDER)
