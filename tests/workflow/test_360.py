@@ -48,7 +48,7 @@ def test_all_stages_did_what_they_should(finished):
     results = {name: stage["done"]["text"] for name, stage in record.items()}
     assert results["detect"].startswith("a static artifact"), "in the whole frame, as one camera"
     assert results["process"].startswith(f"{5 * VIEWS} of {5 * VIEWS} photos have poses")
-    assert "the artifact in 2 faces of the panoramas was learned" in results["train"], "of the faces that see the operator"
+    assert "the artifact in 2 faces of the panoramas was learned" in results["train"], "those that see the operator"
     assert "with the artifact that they have" in results["evaluate"]
     assert len(plyread(str(finished[0] / "splats.ply")).means) > 100
 
