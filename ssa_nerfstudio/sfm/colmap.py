@@ -10,7 +10,7 @@ import os
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
-from itertools import islice
+from itertools import count, islice
 from pathlib import Path
 
 import numpy as np
@@ -141,10 +141,13 @@ class StructureFromMotion:
         free = [number for number, each in enumerate(self._passes, 1) if each.mount is None]
         if not kept and free and not is_complete(model, total):
             guessed = [number for number in free if not self._is_lens_known(number)]
+            # Several mappings, each of up to all photos.
+            again = count(1)
             other = map_with_held_lens(
                 *(self._database, self._images, models / "held", lambda: self._mapping_options(total)),
-                *(guessed, model, lambda: on_progress("poses", 0, total)),
+                *(guessed, model, lambda: on_progress("other lenses", next(again) * at_once % total, total)),
             )
+            on_progress("other lenses", total, total)
             model = better(model, other)
         if model is not None:
             if kept:

@@ -39,7 +39,7 @@ def processed(capture: Path, output: Path, hidden: np.ndarray) -> tuple[Summary,
         found=[found],
         on_progress=show,
     )
-    assert shown.keys() <= {"photos", "detection", "artifact", "features", "matches", "poses"}
+    assert shown.keys() <= {"photos", "detection", "artifact", "features", "matches", "poses", "other lenses"}
     assert all(min(shares) >= 0 and max(shares) == shares[-1] == 1 for shares in shown.values())
     return summary, {*shown}
 
