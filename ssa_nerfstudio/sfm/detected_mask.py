@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 _SIZE = 960
 """Longest side to which photos are reduced for detection, pixels: twice its working resolution."""
 
+_WHOLE_FRAME = 0.999
+"""Share of the frame from which on a mask is of all of it, but for pixels at its border."""
+
 
 @dataclass(frozen=True)
 class FoundArtifact:
@@ -85,6 +88,10 @@ class CameraEvidence:
         height, width = read_photo(self._files[0]).shape[:2]
         used = (~self._found.mask).astype(np.uint8)
         return cv2.resize(used, (width, height), interpolation=cv2.INTER_NEAREST) > 0
+
+    def stands_still(self) -> bool:
+        """Whether nothing moves anywhere in the frame, which an artifact leaves a part of."""
+        return float(self._found.mask.mean()) >= _WHOLE_FRAME
 
     def unchanged_stretches(self) -> list[slice]:
         """Stretches of photos with an artifact, opaque or not, that does not change in them; empty where there is none.

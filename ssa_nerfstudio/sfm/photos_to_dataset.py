@@ -164,6 +164,9 @@ def process(
             masked_by = "user" if mask is not None else "detection" if detected else None
             check_registrations(registered, min_registered, masked_by)
         except InputError as error:
+            if any(each.stands_still() for each in evidence):
+                problem = f"{error.problem}: nothing in them moves, as in copies of one photo or from a tripod"
+                raise InputError(problem, "take photos from several places") from error
             work.keep_after_error = True
             remedy = (
                 f"{error.remedy}; the same command with a lower --min-registered continues (its work is in {work.path})"

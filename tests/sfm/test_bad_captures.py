@@ -107,6 +107,12 @@ def test_photos_that_show_nothing_in_common_stop_the_command(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == [".out.work", "photos"]
 
 
+def test_copies_of_one_photo_are_not_told_to_overlap_more(tmp_path, photos, capsys):
+    write(tmp_path / "photos", [photos(12)[0]] * 8)
+    line = refused(capsys, tmp_path, "--threads", "1")
+    assert "nothing in them moves, as in copies of one photo or from a tripod; take photos from several places" in line
+
+
 @pytest.mark.parametrize("blocks", [1, 300, 600], ids=["photos", "database", "more of the database"])
 def test_a_full_disk(blocks, tmp_path, photos):
     """A real process whose files may not grow beyond a limit, as on a full disk."""
