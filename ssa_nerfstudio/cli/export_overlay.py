@@ -32,8 +32,9 @@ class Command:
     step: int | None = None
     """Checkpoint to read; the newest where not given."""
     apply: Path | None = None
-    """Folder of photos, original or undistorted, at any resolution: written without the artifact to OUTPUT/photos,
-    black where the matte is above --threshold. Photos that do not show the artifact are written as they are."""
+    """Folder of photos or of a video's frames, original or undistorted, at any resolution: written without the artifact
+    to OUTPUT/photos, black where the matte is above --threshold. Photos that do not show the artifact are written as
+    they are."""
     camera: int | None = None
     """For --apply with a rig, or where the artifact changes: the overlay of these photos, counted from 0 as in
     overlay.json."""

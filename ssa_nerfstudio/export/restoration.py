@@ -16,7 +16,7 @@ import scipy.optimize
 from PIL import Image
 
 from ssa_nerfstudio.data.photos import open_photo, read_photo, write_photo
-from ssa_nerfstudio.data.sources import PHOTO_SUFFIXES
+from ssa_nerfstudio.data.sources import PHOTO_SUFFIXES, VIDEO_SUFFIXES
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 
@@ -154,7 +154,9 @@ def find_photos(folder: Path) -> list[Path]:
         InputError: there are none, or the restored photos of two would have one name.
     """
     if not folder.is_dir():
-        raise InputError(f"{folder} is no folder", "choose the folder of the photos")
+        video = folder.suffix.lower() in VIDEO_SUFFIXES
+        frames = "write its frames to a folder, as by ffmpeg -i CLIP FOLDER/%05d.png, and give that"
+        raise InputError(f"{folder} is no folder", frames if video else "choose the folder of the photos")
     photos = sorted(path for path in folder.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
     if not photos:
         suffixes = ", ".join(sorted(PHOTO_SUFFIXES))

@@ -389,6 +389,7 @@ def spoil_photo(tmp_path: Path) -> list[object]:
         (lambda folder: ["--camera", 0], "add --apply PHOTOS"),
         (lambda folder: ["--step", 77], "no checkpoint of step 77; there are 9"),
         (lambda folder: ["--apply", folder / "nowhere"], "is no folder"),
+        (lambda folder: ["--apply", folder / "clip.MP4"], "write its frames to a folder, as by ffmpeg"),
         (spoil_nothing, "holds no photos"),
         (spoil_size, "a.png is 50 x 50"),
         (spoil_photo, "a.jpg cannot be read as a photo"),
