@@ -42,6 +42,7 @@ from ssa_nerfstudio.sfm.photos_to_dataset import Summary
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 from ssa_nerfstudio.workflow.detection_folder import VERDICTS, found_artifacts, write_found
 from ssa_nerfstudio.workflow.finished_training import evaluate, write_view_pictures
+from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_shares
 from ssa_nerfstudio.workflow.resumable_training import config_file, load_trained, train
 from ssa_nerfstudio.workflow.stages import Result, Stage
 
@@ -51,8 +52,6 @@ DETECTION, DATASET, TRAINING, EVALUATION = "detection", "dataset", "training", "
 """Folders of a run, one for each of the first four stages."""
 RECORD = "run.json"
 """File of the finished stages."""
-_MIN_MATTE, _MIN_COVERED = 0.3, 0.001
-"""An overlay whose matte exceeds the first in less than the second of the frame is nearly clear."""
 SPLATS, COMPRESSED = "splats.ply", "splats-compressed.ply"
 
 
@@ -175,8 +174,9 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     decided = {0: "the scene alone was learned", 1: "the artifact was learned with the scene"}
     text = decided.get(overlays, f"{several} learned with the scene")
     resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
+    shares = learned_shares(_pictured(layers, plan.data))
     return Result(
-        f"{text}, in {counted(checkpoint.step + 1, 'step')}{resumed}",
+        f"{text}{shares}, in {counted(checkpoint.step + 1, 'step')}{resumed}",
         tuple(clear_overlays(layers)),
     )
 
@@ -202,18 +202,6 @@ def warn_of_missed_artifacts(plan: Plan, overlays: Sequence[str]) -> None:
         f"detection found an artifact in the photos{of}, the training in {learned}; if one is left in the splats, run "
         "with --train.pipeline.model.overlay on and another --output"
     )
-
-
-def clear_overlays(layers: Sequence[ArtifactLayers]) -> list[str]:
-    """Warnings of artifacts that the training was told of and has not learned."""
-    clear = [layer.name for layer in layers if (layer.straight()[1] > _MIN_MATTE).mean() < _MIN_COVERED]
-    if not clear:
-        return []
-    of = f" of {name_list(clear)}" if len(layers) > 1 else ""
-    return [
-        f"the overlay{of} is nearly clear: what was found there may be left in the splats; look at them, and add "
-        "photos from other places"
-    ]
 
 
 def _verdicts(plan: Plan) -> dict[str, str]:

@@ -12,7 +12,8 @@ import pytest
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 from ssa_nerfstudio.workflow.detection_folder import VERDICTS
-from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, clear_overlays, warn_of_missed_artifacts
+from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_shares
+from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, warn_of_missed_artifacts
 
 
 def layers(name: str, covered: int) -> ArtifactLayers:
@@ -67,3 +68,9 @@ def test_an_overlay_that_stayed_clear_is_named():
     assert "the overlay of frame_right is nearly clear" in warning
     assert clear_overlays([layers("frame_down", 9), layers("frame_right", 2)]) == []
     assert clear_overlays([]) == []
+
+
+def test_what_was_learned_is_said_with_its_share_of_the_frame():
+    assert learned_shares([layers("camera_0", 9)]) == ", over 45.0% of the frame"
+    assert learned_shares([layers("front", 9), layers("side", 1)]) == ", over 45.0% of front, 5.0% of side"
+    assert learned_shares([]) == ""
