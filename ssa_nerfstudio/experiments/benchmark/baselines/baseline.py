@@ -20,6 +20,7 @@ from filelock import FileLock
 from torch import nn
 from torch.nn import Parameter
 
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import category
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
@@ -86,8 +87,14 @@ class Baseline:
             config.optimizers[name] = {"optimizer": FusedAdamConfig(lr=rate * shortened), "scheduler": None}
 
     def trained_on(self, run: Run, data: Path) -> Path:
-        """Where the dataset that a run trains on is, or will be: the prepared one, or one beside it."""
+        """Where the dataset that a run trains on is, or will be: the prepared one, or one beside it.
+
+        Raises:
+            InputError: the baseline cannot be trained with the run's settings.
+        """
         self.check(_own_settings(run))
+        if self.learning_rates and run.model.get("exposure", "off") != "off":
+            raise InputError(f"{run.baseline} predicts photos without their exposures", "set exposure: off for it")
         if self.dataset is None:
             return data
         digest = zlib.crc32(json.dumps(_own_settings(run), sort_keys=True).encode())

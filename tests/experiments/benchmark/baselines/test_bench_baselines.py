@@ -117,6 +117,16 @@ def test_without_weights_nothing_begins_and_one_line_says_what_to_fetch(tmp_path
     assert not (tmp_path / "results" / "scenes").exists()
 
 
+@pytest.mark.parametrize("method", ["desplat", "dc-gaussian"])
+def test_exposures_that_a_baseline_would_ignore_are_refused_before_anything_begins(tmp_path, capsys, method):
+    (tmp_path / "few.yaml").write_text(FILE.format(methods=method).replace("{num", "{exposure: affine, num"))
+    with pytest.raises(SystemExit) as refusal:
+        main(["bench", str(tmp_path / "few.yaml"), "--output", str(tmp_path / "results")])
+    assert refusal.value.code == 2
+    assert "predicts photos without their exposures; set exposure: off for it" in capsys.readouterr().err
+    assert not (tmp_path / "results" / "scenes").exists()
+
+
 def _moved(config: Path):
     def update(stated):
         stated.output_dir = config.parents[3]
