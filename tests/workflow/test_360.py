@@ -40,7 +40,7 @@ def test_it_says_in_one_line_what_it_takes_the_clip_for(finished):
     (line,) = [line for line in finished[1].splitlines() if "equirectangular" in line]
     assert re.search(r"walk\.mp4 is taken for equirectangular \(512 x 256\): cut into perspective faces", line)
     assert "(front, right, back, left, down)" in line
-    assert "--projection perspective" in line
+    assert "(--process.projection perspective takes" in line
 
 
 def test_all_stages_did_what_they_should(finished):
