@@ -76,8 +76,8 @@ class SSATrainerConfig(TrainerConfig):
         check_port(self.viewer.websocket_port)
         check_device(self.machine.device_type)
         check_settings(self.pipeline.model, self.machine.device_type)
-        check_intervals(self)
         check_length(self.max_num_iterations, self.pipeline.datamanager.camera_res_scale_factor)
+        check_intervals(self)
 
 
 class SSATrainer(Trainer):

@@ -90,8 +90,14 @@ class CameraEvidence:
         return cv2.resize(used, (width, height), interpolation=cv2.INTER_NEAREST) > 0
 
     def stands_still(self) -> bool:
-        """Whether nothing moves anywhere in the frame, which an artifact leaves a part of."""
-        return float(self._found.mask.mean()) >= _WHOLE_FRAME
+        """Whether nothing moves anywhere in the frame, of which an artifact leaves a part; False if it is not known.
+
+        Photos that cannot be tested, such as transparent ones, tell nothing.
+        """
+        try:
+            return float(self._found.mask.mean()) >= _WHOLE_FRAME
+        except InputError:
+            return False
 
     def unchanged_stretches(self) -> list[slice]:
         """Stretches of photos with an artifact, opaque or not, that does not change in them; empty where there is none.
