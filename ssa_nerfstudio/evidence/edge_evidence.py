@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -54,7 +55,7 @@ class EdgeEvidence:
         """`edge_shares` of the fields."""
         return edge_shares(self.fields, self.still)
 
-    @property
+    @cached_property
     def mask(self) -> np.ndarray:
         """The artifact's edges at the working resolution, uint8 [h, w]: coarse ones where fine ones are too few."""
         h, w = self.fields[0].shape

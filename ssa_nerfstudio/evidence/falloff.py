@@ -53,11 +53,11 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
     return (log_transmittance - clear).exp().clamp(_GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
-def _chance(variances: Tensor, first: int) -> float:
-    """Probability that the first of some modes [K] of equal variance have as large a share as these (F-test)."""
-    others = variances[first:].mean()
-    ratio = float(variances[:first].mean() / others) if others > 0 else 0.0
-    return float(fdtrc(first, len(variances) - first, ratio))
+def _chance(squares: Tensor, first: int) -> float:
+    """Probability that the first of modes of equal variance have as large a share of these squares [K] (F-test)."""
+    others = squares[first:].mean()
+    ratio = float(squares[:first].mean() / others) if others > 0 else 0.0
+    return float(fdtrc(first, len(squares) - first, ratio))
 
 
 def _modes(height: int, width: int) -> Tensor:

@@ -122,11 +122,11 @@ def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor, likely: Tensor | 
         layers: T and B.
         likely: the artifact's color where the layers have missed it, [H, W, 3] in [0, 1]; None: its mean color.
     """
-    likely = _mean_color(layers) if likely is None else _at_overlay_resolution(likely, overlay)
     transmittance, addition = _at_overlay_resolution(layers, overlay).split((1, 3), dim=-1)
     if overlay.adds_light:
         overlay.initialize(addition, 1 - transmittance, transmittance)
         return
+    likely = _mean_color(layers) if likely is None else _at_overlay_resolution(likely, overlay)
     alpha = smallest_matte(transmittance, addition)
     floor = INITIAL_MATTE_RANGE[0]
     overlay.initialize((addition + floor * likely) / (alpha + floor), alpha, transmittance)

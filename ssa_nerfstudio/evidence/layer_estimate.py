@@ -78,10 +78,10 @@ class LayerEstimate:
         excess = (1 - hidden / added.clamp_min(1e-6)).clamp(0, 1)
         detail = (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0).square()
         opacity = self.opacity()
-        artifact = (opacity > MIN_OPACITY) * opacity.square()
-        light = (opacity > MIN_OPACITY) * excess * added.square()
+        present = opacity > MIN_OPACITY
+        light, whole = (excess * added.square())[present].sum(), opacity[present].square().sum()
         mostly = (detail * excess).sum() > 0.5 * detail.sum()
-        return bool(mostly & (light.sum() > MIN_ADDED_SHARE * artifact.sum()))
+        return bool(mostly & (light > MIN_ADDED_SHARE * whole))
 
 
 @torch.no_grad()
