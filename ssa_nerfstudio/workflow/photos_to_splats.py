@@ -23,8 +23,7 @@ from PIL import Image
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
-from ssa_nerfstudio.cameras.intervals import BEGINNING
-from ssa_nerfstudio.data.panorama_entry import read_panorama
+from ssa_nerfstudio.data.panorama_entry import Panorama, read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
 from ssa_nerfstudio.evidence.capture_detection import Camera, detect_camera
@@ -42,7 +41,7 @@ from ssa_nerfstudio.sfm.photos_to_dataset import Summary
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 from ssa_nerfstudio.workflow.detection_folder import VERDICTS, found_artifacts, write_found
 from ssa_nerfstudio.workflow.finished_training import evaluate, write_view_pictures
-from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_shares
+from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_in_words, learned_shares
 from ssa_nerfstudio.workflow.resumable_training import config_file, load_trained, train
 from ssa_nerfstudio.workflow.stages import Result, Stage
 
@@ -165,16 +164,10 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     began = train(plan.training, on_progress, partial(warn_of_missed_artifacts, plan))
     _free_memory()
     checkpoint = Checkpoint.read(config_file(plan.training))
-    layers = _layers(checkpoint)
-    overlays, several = len(layers), f"the artifacts of {len(layers)} cameras were"
-    if any(layer.start != BEGINNING for layer in layers):
-        several = f"the artifacts of {overlays} intervals were"
-    elif read_panorama(Transforms.read(plan.data)) is not None:
-        several = f"the artifact in {overlays} faces of the panoramas was"
-    decided = {0: "the scene alone was learned", 1: "the artifact was learned with the scene"}
-    text = decided.get(overlays, f"{several} learned with the scene")
+    layers, panorama = _layers(checkpoint), read_panorama(Transforms.read(plan.data))
+    text = learned_in_words(layers, panorama is not None)
+    shares = learned_shares(_pictured(layers, panorama))
     resumed = f" (continued at step {began:,}; the time is since then)" if began else ""
-    shares = learned_shares(_pictured(layers, plan.data))
     return Result(
         f"{text}{shares}, in {counted(checkpoint.step + 1, 'step')}{resumed}",
         tuple(clear_overlays(layers)),
@@ -234,7 +227,8 @@ def _evaluate(plan: Plan, on_progress: ProgressCallback) -> Result:
 
 def _export(plan: Plan, on_progress: ProgressCallback) -> Result:
     checkpoint = Checkpoint.read(config_file(plan.training))
-    gaussians, layers = checkpoint.gaussians(), _pictured(_layers(checkpoint), plan.data)
+    gaussians, panorama = checkpoint.gaussians(), read_panorama(Transforms.read(plan.data))
+    layers = _pictured(_layers(checkpoint), panorama)
     kept = select(gaussians).kept
     with unwritable_as_input_error(plan.output):
         write_ply(plan.output / SPLATS, gaussians, kept)
@@ -256,12 +250,11 @@ def _layers(checkpoint: Checkpoint) -> list[ArtifactLayers]:
     return undistorted_layers(checkpoint) if checkpoint.has_overlay else []
 
 
-def _pictured(layers: list[ArtifactLayers], data: Path) -> list[ArtifactLayers]:
+def _pictured(layers: list[ArtifactLayers], panorama: Panorama | None) -> list[ArtifactLayers]:
     """What the artifact's pictures show: every camera's, or one on the sphere where the cameras are faces of it.
 
     Where a face's artifact changes, every overlay of every face.
     """
-    panorama = read_panorama(Transforms.read(data))
     if panorama is None or not layers or face_changes(layers):
         return layers
     return [panorama_layers(layers, panorama)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,7 +13,7 @@ import pytest
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
 from ssa_nerfstudio.workflow.detection_folder import VERDICTS
-from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_shares
+from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_in_words, learned_shares
 from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, warn_of_missed_artifacts
 
 
@@ -68,6 +69,16 @@ def test_an_overlay_that_stayed_clear_is_named():
     assert "the overlay of frame_right is nearly clear" in warning
     assert clear_overlays([layers("frame_down", 9), layers("frame_right", 2)]) == []
     assert clear_overlays([]) == []
+
+
+def test_what_was_learned_is_called_by_what_the_overlays_are_of():
+    front, side = layers("front", 9), layers("side", 1)
+    assert learned_in_words([], False) == "the scene alone was learned"
+    assert learned_in_words([front], True) == "the artifact was learned with the scene"
+    assert learned_in_words([front, side], False) == "the artifacts of 2 cameras were learned with the scene"
+    assert learned_in_words([front, side], True).startswith("the artifact in 2 faces of the panoramas was learned")
+    later = replace(front, start="img_9.jpg")
+    assert learned_in_words([front, later], True) == "the artifacts of 2 intervals were learned with the scene"
 
 
 def test_what_was_learned_is_said_with_its_share_of_the_frame():
