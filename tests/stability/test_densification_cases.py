@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import pytest
 import torch
 from hard_cases import Case, Family
 
@@ -19,10 +20,11 @@ enable_mcmc_on_cpu()
 
 
 def gaussians(n: int) -> tuple[Params, Optimizers]:
-    """Ordinary Gaussians, alive, with optimizers that have made a step."""
-    generator = torch.Generator().manual_seed(n)
+    """Ordinary Gaussians, alive, with optimizers that have made a step; the same numbers on every device."""
+    generator, device = torch.Generator("cpu").manual_seed(n), torch.get_default_device()
     shapes = {"means": (n, 3), "scales": (n, 3), "quats": (n, 4), "features_dc": (n, 3), "opacities": (n, 1)}
-    params = Params({k: torch.nn.Parameter(0.5 * torch.randn(s, generator=generator)) for k, s in shapes.items()})
+    drawn = {k: 0.5 * torch.randn(s, generator=generator, device="cpu") for k, s in shapes.items()}
+    params = Params({k: torch.nn.Parameter(value.to(device)) for k, value in drawn.items()})
     params["scales"].data -= 5
     params["opacities"].data.abs_()
     optimizers: Optimizers = {k: torch.optim.Adam([p], lr=1e-3, eps=1e-15) for k, p in params.items()}
@@ -250,3 +252,12 @@ def _() -> None:
 def test_densification(case: Case) -> None:
     torch.manual_seed(0)
     case.check()
+
+
+@pytest.mark.stability
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@DENSIFICATION.parametrize
+def test_densification_on_cuda(case: Case) -> None:
+    torch.manual_seed(0)
+    with torch.device("cuda"):
+        case.check()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 from hard_cases import Case, Family
 from hypothesis import given, settings
@@ -20,7 +21,10 @@ OVERLAY = Family("Overlay")
 
 
 def random(*shape: int, seed: int = 0) -> Tensor:
-    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+    """The same numbers on every device, on the default one."""
+    return torch.rand(*shape, generator=torch.Generator("cpu").manual_seed(seed), device="cpu").to(
+        torch.get_default_device()
+    )
 
 
 def filled(height: int, width: int, alpha: float, color: float, resolution: int = 1) -> ScreenSpaceOverlay:
@@ -155,7 +159,7 @@ def _() -> None:
 @OVERLAY.case("float16 under autocast", "Gradients of 1e-8 are 0 in float16.", torch.float16)
 def _half(dtype: torch.dtype) -> None:
     overlay, clean = filled(20, 24, 6.9, 2.0), random(20, 24, 3).requires_grad_()
-    with torch.autocast("cpu", dtype=dtype):
+    with torch.autocast(torch.get_default_device().type, dtype=dtype):
         step(overlay, clean, random(20, 24, 3, seed=1))
     assert overlay.matte().dtype == torch.float32
     assert clean.grad is not None
@@ -265,3 +269,11 @@ OVERLAY.case("any color and matte, premultiplied and back", "The division by the
 @OVERLAY.parametrize
 def test_overlay(case: Case) -> None:
     case.check()
+
+
+@pytest.mark.stability
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@OVERLAY.parametrize
+def test_overlay_on_cuda(case: Case) -> None:
+    with torch.device("cuda"):
+        case.check()
