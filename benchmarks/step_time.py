@@ -2,18 +2,20 @@
 
 Full resolution, unscaled schedules, the whole body of nerfstudio's training loop, steps 700 to 1099 of one process; the
 device is synchronized at both ends only. Run the methods in turn, several times: a machine drifts more than they
-differ.
+differ; with --alternate one process trains with CUDA graphs and without by turns. --profile writes where the host's
+time goes.
 """
 
 from __future__ import annotations
 
 import copy
+import os
 import random
 import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -29,6 +31,10 @@ from ssa_nerfstudio.plugin.methods import METHODS
 FIRST, LAST = 699, 1099
 """Steps between which the time is taken: after Triton's compilation and the first refinement, at step 600, which takes
 150 ms to load its kernels."""
+TURN = 100
+"""Steps of a turn with --alternate, as many as from one refinement to the next."""
+PROFILED = (640, 680)
+"""Steps between which the profile is taken."""
 
 
 @dataclass
@@ -42,8 +48,13 @@ class Command:
     overlay: Literal["on", "off"] = "on"
     """Whether the method learns an overlay; splatfacto has none."""
 
+    alternate: bool = False
+    """Take eight turns of 100 steps, with CUDA graphs and without (SSA_CUDA_GRAPHS=0), and print a line for both."""
+    profile: Path | None = None
+    """Write a table of torch's profiler to this file, and end after the steps that are in it."""
+
     def run(self) -> None:
-        """Train 1100 steps and print one line.
+        """Train 1100 steps and print one line; or 680 and write a file.
 
         Raises:
             InputError: the dataset cannot be trained on.
@@ -71,20 +82,63 @@ class Command:
         trainer.setup()
         trainer.config.viewer.quit_on_train_completion = True
         writer.EVENT_WRITERS.clear()  # tensorboard's; splatfacto's default, the viewer, has none
+        if self.profile is not None:
+            trainer.config.max_num_iterations = PROFILED[1] + 1
+            _write_profile(trainer, self.profile)
+            return
+        last = FIRST + 8 * TURN if self.alternate else LAST
+        trainer.config.max_num_iterations = last + 1
         times: dict[int, float] = {}
 
         def note(step: int) -> None:
-            if step in (FIRST, LAST):
+            if step in (FIRST, last) or (self.alternate and (step - FIRST) % TURN == 0):
                 if torch.cuda.is_available():
                     torch.cuda.synchronize()
                 times[step] = time.perf_counter()
+                if self.alternate:
+                    os.environ["SSA_CUDA_GRAPHS"] = str((step - FIRST) // TURN % 2)
 
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
         trainer.train()
-        milliseconds = 1e3 * (times[LAST] - times[FIRST]) / (LAST - FIRST)
-        print(
-            f"{self.method} {self.overlay}: {milliseconds:.3f} ms a step, {trainer.pipeline.model.num_points} Gaussians"
-        )
+        for graphs in ("off", "on") if self.alternate else ("",):
+            begin = FIRST + TURN * (graphs == "on")
+            turns = range(begin, last, 2 * TURN) if self.alternate else [FIRST]
+            length = TURN if self.alternate else last - FIRST
+            found = [1e3 * (times[turn + length] - times[turn]) / length for turn in turns]
+            what = f"{self.method} {self.overlay}{graphs and f', CUDA graphs {graphs}'}"
+            each = f" ({', '.join(f'{value:.3f}' for value in found)})" if found[1:] else ""
+            count = trainer.pipeline.model.num_points
+            print(f"{what}: {sum(found) / len(found):.3f} ms a step{each}, {count} Gaussians")
+
+
+def _write_profile(trainer: Any, path: Path) -> None:
+    """Train, and write what `PROFILED` holds: launches and milliseconds a step, operations by the host's own time."""
+    profiler = torch.profiler.profile(activities=torch.profiler.supported_activities())
+
+    def note(step: int) -> None:
+        if step == PROFILED[0]:
+            profiler.start()
+        elif step == PROFILED[1]:
+            if torch.cuda.is_available():
+                torch.cuda.synchronize()
+            profiler.stop()
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
+    trainer.train()
+    found, steps = profiler.key_averages(), PROFILED[1] - PROFILED[0]
+    names = ("launch", "memcpyasync", "memsetasync", "synchronize")
+    runtime = {e.key: e.count / steps for e in found if any(name in e.key.lower() for name in names)}
+    busy = sum(e.self_device_time_total for e in found if e.device_type != torch.autograd.DeviceType.CPU)
+    lines = [
+        f"{trainer.pipeline.model.num_points} Gaussians, steps {PROFILED[0]} to {PROFILED[1]}",
+        f"aten operations a step: {sum(e.count for e in found if e.key.startswith('aten::')) / steps:.1f}",
+        f"host, own time of all operations: {sum(e.self_cpu_time_total for e in found) / 1e3 / steps:.3f} ms a step",
+        f"device busy: {busy / 1e3 / steps:.3f} ms a step",
+        *(f"{name}: {count:.2f} a step" for name, count in sorted(runtime.items(), key=lambda item: -item[1])),
+        "",
+        found.table(sort_by="self_cpu_time_total", row_limit=40, max_name_column_width=80),
+    ]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

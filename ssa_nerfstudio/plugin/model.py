@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
-import torch.nn.functional as F
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.model_components.lib_bilagrid import total_variation_loss
 from nerfstudio.models.splatfacto import SplatfactoModel
@@ -14,6 +13,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import Parameter
 
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable, parameters_replaced
 from ssa_nerfstudio.overlay.compositing import clip_straight_through, composite
 from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.resampling import straight_color
@@ -23,10 +23,11 @@ from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_lpips
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_metrics
 from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
-from ssa_nerfstudio.plugin.photo_formation import predicted_photo
+from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
+from ssa_nerfstudio.plugin.training.regularizers import regularizers
 from ssa_nerfstudio.plugin.training.seed_points import color_parameters, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
@@ -48,6 +49,8 @@ class SSASplatfactoModel(SplatfactoModel):
     """
 
     config: SSASplatfactoModelConfig
+    recordable: ClassVar[bool] = True
+    """Whether nothing but `_photo_losses` reads the pictures of a training step, so that they need not be there."""
     strategy: AdaptiveDensityControl | MarkovChainMonteCarlo
     near_plane: Tensor
     """Depth (world units) below which cameras draw nothing."""
@@ -67,6 +70,7 @@ class SSASplatfactoModel(SplatfactoModel):
             self.gauss_params["features_dc"] = Parameter(color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
+        self._recorded = RecordedCalls(CapturedPrograms)
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
@@ -161,9 +165,8 @@ class SSASplatfactoModel(SplatfactoModel):
         if is_viewer_frame():
             return self._controls.outputs(drawn, camera, width, height) if len(self.artifacts) else drawn
         if self.training:
-            view, ignored = metadata(camera).get("cam_idx"), self.config.ignore_background
-            photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored)
-            return drawn if photo is None else {**drawn, "composite": photo}
+            view = metadata(camera).get("cam_idx")
+            return {**drawn, "view": view} if "color" in drawn else self._with_photo(drawn, view)
         if len(self.artifacts):
             layers = self.artifacts.layers_of_camera(camera, width, height)
             if layers is None:  # one camera of several: a mean over all needs its composite, too
@@ -210,13 +213,14 @@ class SSASplatfactoModel(SplatfactoModel):
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
         background = self._get_background_color()
-        # squeeze, because the gradient of an index or a slice fills a frame with zeros first; hardtanh, because its
-        # gradient is one kernel and clamp's are five.
+        # squeeze, because the gradient of an index or a slice fills a frame with zeros first
         accumulation, color = alpha.squeeze(0), render.squeeze(0)
+        if self._losses_are_recorded(with_depth):
+            return {"color": color, "accumulation": accumulation, "background": background}
         if with_depth:
             color = color[..., :3]
         white = BRIGHTEST if self.training and self.exposure is not None else 1.0
-        rgb = F.hardtanh(torch.addcmul(color, 1.0 - accumulation, background), 0.0, white)
+        rgb = clean_image(color, accumulation, background, white)
         if self.config.use_bilateral_grid and self.training:
             rgb = self._apply_bilateral_grid(rgb[None], metadata(camera)["cam_idx"], height, width)[0]
         depth = None
@@ -228,6 +232,21 @@ class SSASplatfactoModel(SplatfactoModel):
             "accumulation": accumulation,
             "background": background if self.training else background.expand(height, width, 3),
         }
+
+    def _with_photo(self, drawn: dict[str, Any], view: int | None) -> dict[str, Any]:
+        """What is drawn for a training view, and `composite` where the photo is predicted as another image."""
+        reduction, ignored = self._get_downscale_factor(), self.config.ignore_background
+        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored)
+        return drawn if photo is None else {**drawn, "composite": photo}
+
+    def _losses_are_recorded(self, with_depth: bool) -> bool:
+        """Whether this step computes from the render to the loss in one launch."""
+        return self._nothing_else_is_read(with_depth) and self.device.type == "cuda" and graphs_are_usable()
+
+    def _nothing_else_is_read(self, with_depth: bool) -> bool:
+        """Whether only `_photo_losses` reads the pictures of this step, and they need no parameter of the view."""
+        settings = with_depth or self.config.use_bilateral_grid or self.exposure is not None
+        return self.training and self.recordable and not settings and self.step % self.metrics_every != 0
 
     def _view_matrix(self, camera: Cameras) -> Tensor:
         """World to camera [1, 4, 4], with the camera optimizer's correction while training."""
@@ -244,29 +263,47 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's loss: photometric on the composite, sparsity of the matte, and the strategy's own terms."""
+        losses = self._photo_losses(outputs, batch) if "rgb" in outputs else self._recorded_losses(outputs, batch)
+        if not self.training:
+            return losses
+        losses |= regularizers(self.config, self.scales, self.opacities, self.step)
+        self.camera_optimizer.get_loss_dict(losses)
+        if self.config.use_bilateral_grid:
+            losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
+        return losses
+
+    def _photo_losses(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
+        """The terms that depend on the photo or the overlays alone."""
         target = self.target(outputs, batch)
         shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
         mask = self.loss_mask(shown, target, batch)
         if mask is not None:
             target, shown = target * mask, shown * mask
         losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
-        if not self.training:
-            return losses
-        learned = self.artifacts.learned()
+        learned = self.artifacts.learned() if self.training else []
         if learned and self.config.sparsity != "off":
             terms = [sparsity_loss(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
             losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
-        if self.config.strategy == "mcmc":
-            losses["opacity_reg"] = self.config.mcmc_opacity_regularizer * torch.sigmoid(self.opacities).mean()
-            losses["mcmc_scale_reg"] = self.config.mcmc_scale_regularizer * torch.exp(self.scales).mean()
-        if self.config.use_scale_regularization and self.step % 10 == 0:
-            spread = self.scales.amax(dim=-1) - self.scales.amin(dim=-1)
-            excess = torch.exp(spread).clamp_min(self.config.max_gauss_ratio) - self.config.max_gauss_ratio
-            losses["scale_reg"] = 0.1 * excess.mean()
-        self.camera_optimizer.get_loss_dict(losses)
-        if self.config.use_bilateral_grid:
-            losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
+
+    def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
+        """`_photo_losses` of a training view of which only the splats were drawn, as one CUDA graph."""
+        photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
+        splats = [drawn[name] for name in ("color", "accumulation", "background")]
+
+        def compute(color: Tensor, accumulation: Tensor, background: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+            rgb = clean_image(color, accumulation, background, 1.0)
+            shown = {"rgb": rgb, "accumulation": accumulation, "background": background}
+            with parameters_replaced(self.artifacts, others[len(photo) :]):
+                losses = self._photo_losses(self._with_photo(shown, drawn["view"]), dict(zip(photo, others)))  # noqa: B905
+            return tuple(losses.values())
+
+        view = drawn["view"] if len(self.artifacts) else None
+        kind = None if view is None else self.artifacts.group_of_view(view), tuple(photo)
+        values = self._recorded(
+            compute, [*splats, *photo.values()], list(self.artifacts.parameters()), kind, self._get_downscale_factor()
+        )
+        return dict(zip(("main_loss", "sparsity"), values))  # noqa: B905 - where there is a second
 
     def loss_mask(self, shown: Tensor, target: Tensor, batch: dict) -> Tensor | None:
         """Weight [H, W, 1] of every pixel in the photometric loss: the dataset's mask, None where there is none."""

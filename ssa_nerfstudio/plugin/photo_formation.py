@@ -8,11 +8,26 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.compositing import clip_straight_through
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
+
+
+def clean_image(color: Tensor, accumulation: Tensor, background: Tensor, white: float) -> Tensor:
+    """The clean render [H, W, 3]: splats over a background, clipped to [0, white].
+
+    Args:
+        color: of the splats alone, premultiplied [H, W, 3].
+        accumulation: their opacity [H, W, 1].
+        background: [3].
+        white: 1, or more where a photo's exposure may bring it back below 1.
+    """
+    # hardtanh, because its gradient is one kernel and clamp's are five.
+    return F.hardtanh(torch.addcmul(color, 1.0 - accumulation, background), 0.0, white)
 
 
 def predicted_photo(

@@ -130,6 +130,7 @@ def find(name: str) -> Baseline:
 class BaselineModel(SSASplatfactoModel):
     """splatfacto with modules that are learned beside the scene. Only training needs them: viewers load the scene."""
 
+    recordable = False  # subclasses read the pictures
     beside: nn.ModuleDict
     """Modules by the name of their learning rate; `examine` fills it."""
 

@@ -1,0 +1,238 @@
+"""Functions of fixed shapes as CUDA graphs: one launch for their values, one for their gradients.
+
+A training step of splats waits for its host, which launches some two hundred kernels one by one. With
+SSA_CUDA_GRAPHS=0 it does so everywhere; the kernels are the same.
+"""
+
+from __future__ import annotations
+
+import gc
+import logging
+import os
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+Function = Callable[..., tuple[Tensor, ...]]
+"""Of tensors. It draws no random numbers, reads nothing from the device and launches the same kernels at every call."""
+Program = Callable[[], list[Tensor]]
+Record = Callable[[Program], tuple[list[Tensor], Callable[[], object]]]
+"""Records a program: where its results are going to be, and what computes them there, any number of times."""
+_LOG = logging.getLogger(__name__)
+
+
+def graphs_are_usable() -> bool:
+    """Whether there is CUDA, and SSA_CUDA_GRAPHS is not 0."""
+    return torch.cuda.is_available() and os.environ.get("SSA_CUDA_GRAPHS", "1") != "0"
+
+
+class CapturedPrograms:
+    """A `Record` that captures CUDA graphs, all in one pool of memory.
+
+    Programs that are captured later may use memory that earlier ones only need while they run.
+    """
+
+    def __init__(self) -> None:
+        self._pool = torch.cuda.graph_pool_handle()
+        self._stream = torch.cuda.Stream()
+
+    def __call__(self, program: Program) -> tuple[list[Tensor], Callable[[], object]]:
+        """Run a program once, then capture it: libraries and kernels must be loaded before."""
+        graph = torch.cuda.CUDAGraph()
+        with self._aside():
+            program()
+        with self._aside():
+            # Not torch.cuda.graph, which also collects garbage and empties the cache, a tenth of a second each time.
+            # Other threads (the viewer's) may use CUDA meanwhile.
+            graph.capture_begin(pool=self._pool, capture_error_mode="thread_local")
+            try:
+                results = program()
+            finally:
+                graph.capture_end()
+        return results, graph.replay
+
+    @contextmanager
+    def _aside(self) -> Iterator[None]:
+        """On a stream beside the current one, without Python freeing what a capture must not."""
+        current, collecting = torch.cuda.current_stream(), gc.isenabled()
+        self._stream.wait_stream(current)
+        gc.disable()
+        try:
+            with torch.cuda.stream(self._stream):
+                yield
+        finally:
+            current.wait_stream(self._stream)
+            if collecting:
+                gc.enable()
+
+
+class RecordedFunction:
+    """A function that was recorded once and is repeated in place, differentiable once.
+
+    Inputs are copied to where they were when it was recorded; parameters are read where they are. Values and gradients
+    are valid until the next call, which puts its own in their place.
+    """
+
+    def __init__(
+        self, function: Function, inputs: Sequence[Tensor], parameters: Sequence[Tensor], record: Record
+    ) -> None:
+        """Record a function.
+
+        Args:
+            function: of the inputs and the parameters.
+            inputs: with the shapes, types and needs of a gradient of all later calls.
+            parameters: they must stay where they are.
+            record: `CapturedPrograms`, or what repeats programs on a CPU in a test.
+        """
+        self._parameters = tuple(parameters)
+        self._inputs = [each.detach().clone().requires_grad_(each.requires_grad) for each in inputs]
+        # Under other names, because autograd would wait for the stream on which a parameter was used before.
+        aliases = [each.detach().requires_grad_(each.requires_grad) for each in parameters]
+        arguments = [*self._inputs, *aliases]
+        leaves = [each for each in arguments if each.requires_grad]
+        computed: list[Tensor] = []
+
+        def compute() -> list[Tensor]:
+            with torch.enable_grad():
+                computed[:] = function(*arguments)
+            return [each.detach() for each in computed]
+
+        def differentiate() -> list[Tensor]:
+            values = [each for each in computed if each.requires_grad]
+            # The graph is kept, because a record runs a program more than once.
+            found = torch.autograd.grad(values, leaves, self._slopes, retain_graph=True, allow_unused=True)
+            used[:] = [each is not None for each in found]
+            return [each for each in found if each is not None]
+
+        used: list[bool] = []
+        self._values, self._recompute = record(compute)
+        self._recompute()
+        self._differentiable = [each.requires_grad for each in computed]
+        self._slopes = [torch.zeros_like(each) for each in computed if each.requires_grad]
+        gradients, self._rederive = record(differentiate)
+        found = iter(gradients)
+        of_leaves = iter([next(found) if each else None for each in used])
+        self._gradients = [next(of_leaves) if each.requires_grad else None for each in arguments]
+        computed.clear()
+
+    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        """The function's values, connected to inputs and parameters by autograd."""
+        return _Repeated.apply(self, *inputs, *self._parameters)  # pyright: ignore[reportReturnType]
+
+    def values(self, inputs: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+        """All values for given inputs, and those of them that have no gradient."""
+        _copy(self._inputs, inputs)
+        self._recompute()
+        values = [each.detach() for each in self._values]
+        return values, [each for each, smooth in zip(values, self._differentiable, strict=True) if not smooth]
+
+    def gradients(self, slopes: Sequence[Tensor | None]) -> list[Tensor | None]:
+        """Gradients of inputs and parameters, given those of the values that were computed last."""
+        wanted = [each for each, smooth in zip(slopes, self._differentiable, strict=True) if smooth]
+        for mine, given in zip(self._slopes, wanted, strict=True):
+            if given is None:
+                mine.zero_()
+        pairs = [pair for pair in zip(self._slopes, wanted, strict=True) if pair[1] is not None]
+        _copy([mine for mine, _ in pairs], [given for _, given in pairs if given is not None])
+        self._rederive()
+        return [None if each is None else each.detach() for each in self._gradients]
+
+
+class _Repeated(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, recorded: RecordedFunction, *tensors: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        ctx.recorded = recorded
+        ctx.set_materialize_grads(False)
+        values, constant = recorded.values(tensors)
+        ctx.mark_non_differentiable(*constant)
+        return tuple(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, *slopes: Tensor | None) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        return None, *ctx.recorded.gradients(slopes)
+
+
+class RecordedCalls:
+    """Calls functions plainly at first, and from the second call of a kind on as a recording."""
+
+    def __init__(self, record: Callable[[], Record], limit: int = 8) -> None:
+        """Record nothing yet.
+
+        Args:
+            record: makes what records, once for each epoch.
+            limit: number of recordings that are kept; what comes after them is called plainly.
+        """
+        self._make_record, self._limit = record, limit
+        self._record: Record | None = None
+        self._epoch: Hashable = None
+        self._known: dict[Hashable, RecordedFunction | None] = {}
+        self._failed = False
+
+    def __call__(
+        self,
+        function: Function,
+        inputs: Sequence[Tensor],
+        parameters: Sequence[Tensor],
+        kind: Hashable,
+        epoch: Hashable = None,
+    ) -> tuple[Tensor, ...]:
+        """The function's values.
+
+        Args:
+            function, inputs, parameters: as of `RecordedFunction`.
+            kind: all that a recording depends on beside the inputs' values.
+            epoch: recordings of another one, or of parameters that have moved, are dropped.
+        """
+        plain = self._failed or torch.is_autocast_enabled() or any(each.grad is not None for each in parameters)
+        if plain or not torch.is_grad_enabled():  # gradients that accumulate would be written over
+            return function(*inputs, *parameters)
+        epoch = epoch, *((each.data_ptr(), each.shape) for each in parameters)
+        if epoch != self._epoch:
+            self._known, self._record, self._epoch = {}, None, epoch
+        kind = (kind, *((each.shape, each.dtype) for each in inputs))
+        if kind not in self._known:
+            if len(self._known) < self._limit:
+                self._known[kind] = None
+            return function(*inputs, *parameters)
+        recorded = self._known[kind]
+        if recorded is None:
+            try:
+                self._record = self._record or self._make_record()
+                recorded = self._known[kind] = RecordedFunction(function, inputs, parameters, self._record)
+            except RuntimeError as error:
+                self._failed, self._known = True, {}
+                _LOG.warning(f"CUDA graphs cannot be used, steps take longer: {str(error).splitlines()[0]}")
+                return function(*inputs, *parameters)
+        return recorded(*inputs)
+
+
+@contextmanager
+def parameters_replaced(module: nn.Module, tensors: Sequence[Tensor]) -> Iterator[None]:
+    """Let a module compute with other tensors in place of its parameters, in the order of `parameters()`."""
+    places = [(each, name) for each in module.modules() for name in each._parameters]
+    held = [each._parameters[name] for each, name in places]
+    for (each, name), tensor in zip(places, tensors, strict=True):
+        each._parameters[name] = tensor  # pyright: ignore[reportArgumentType]
+    try:
+        yield
+    finally:
+        for (each, name), parameter in zip(places, held, strict=True):
+            each._parameters[name] = parameter
+
+
+def _copy(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
+    """Copy tensors with one launch for each of their types."""
+    by_type: dict[torch.dtype, tuple[list[Tensor], list[Tensor]]] = {}
+    for target, source in zip(targets, sources, strict=False):
+        if target.data_ptr() != source.data_ptr():
+            pair = by_type.setdefault(target.dtype, ([], []))
+            pair[0].append(target)
+            pair[1].append(source)
+    with torch.no_grad():
+        for pair in by_type.values():
+            torch._foreach_copy_(*pair)  # pyright: ignore[reportPrivateImportUsage]

@@ -1,0 +1,99 @@
+"""A training whose losses are recorded against one that launches everything one by one."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from recordings import CUDA, recorder
+
+from ssa_nerfstudio._system.cuda_graphs import RecordedCalls
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+from ssa_nerfstudio.plugin.trainer import SSATrainer
+
+SETTINGS = pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"overlay": "off"},
+        {"strategy": "mcmc", "ignore_background": False, "sparsity": "l1", "overlay_downscale": 2},
+    ],
+    ids=["default", "without overlay", "others"],
+)
+
+
+@pytest.fixture(scope="module")
+def set_up(tiny_scene, tmp_path_factory, configure_training):
+    """Make a trainer, halving photos for ten steps."""
+
+    def make(device: str, settings: dict) -> SSATrainer:
+        model = {
+            "overlay": "on",
+            "overlay_start": "constant",
+            "num_downscales": 1,
+            "resolution_schedule": 10,
+            **settings,
+        }
+        config = configure_training("ssa-splatfacto", tiny_scene, tmp_path_factory.mktemp("run"), 100, model)
+        config.scale_schedules, config.machine.device_type = False, device
+        torch.manual_seed(0)
+        config.set_timestamp()
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.pipeline.model._recorded = RecordedCalls(recorder(device))
+        return trainer
+
+    return make
+
+
+def record_losses(patch: pytest.MonkeyPatch, recorded: bool) -> None:
+    """Record losses wherever they can be, or nowhere."""
+    possible = SSASplatfactoModel._nothing_else_is_read
+    patch.setattr(SSASplatfactoModel, "_losses_are_recorded", lambda self, depth: recorded and possible(self, depth))
+
+
+@SETTINGS
+def test_recorded_losses_train_the_same(set_up, monkeypatch, settings):
+    trained = []
+    for recorded in (False, True):
+        record_losses(monkeypatch, recorded)
+        trainer = set_up("cpu", settings)
+        model = trainer.pipeline.model
+        for step in range(24):
+            model.step_cb(trainer.optimizers, step)
+            trainer.pipeline.train()
+            trainer.train_iteration(step)
+            model.step_post_backward(step)
+        assert bool(model._recorded._known) == recorded
+        trained.append(model.state_dict())
+        monkeypatch.undo()
+    for name, value in trained[0].items():
+        assert not isinstance(value, torch.Tensor) or torch.equal(trained[1][name], value), name
+
+
+@SETTINGS
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, settings):
+    trainer = set_up(device, settings)
+    model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
+    trainer.pipeline.train()
+    possible = SSASplatfactoModel._losses_are_recorded
+    for step in (1, 2, 3, 4, 11, 12, 13):  # at half the size, then at the whole
+        model.step_cb(trainer.optimizers, step)
+        camera, batch = manager.next_train(step)
+        found = []
+        for recorded in (False, True):
+            trainer.optimizers.zero_grad_some(list(trainer.optimizers.parameters))
+            if not recorded or device == "cpu":
+                record_losses(monkeypatch, recorded)
+            torch.manual_seed(step)  # of the background
+            losses = model.get_loss_dict(model(camera), batch)
+            sum(2.0 * each for each in losses.values()).backward()  # as a gradient scaler's factor
+            found.append({f"loss {name}": value.detach().clone() for name, value in losses.items()})
+            found[-1] |= {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+            monkeypatch.setattr(SSASplatfactoModel, "_losses_are_recorded", possible)
+        assert found[0].keys() == found[1].keys()
+        for name, expected in found[0].items():
+            difference = (found[1][name] - expected).norm() / expected.norm().clamp_min(1e-20)
+            assert difference <= (0 if device == "cpu" else 1e-4), (name, step)  # gsplat adds in any order
+    recordings = [each for each in model._recorded._known.values() if each is not None]
+    assert len(recordings) == 1
