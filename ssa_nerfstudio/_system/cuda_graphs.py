@@ -89,6 +89,7 @@ class RecordedFunction:
             record: `CapturedPrograms`, or what repeats programs on a CPU in a test.
         """
         self._parameters = tuple(parameters)
+        self.calls = 0
         self._inputs = [each.detach().clone().requires_grad_(each.requires_grad) for each in inputs]
         # Under other names, because autograd would wait for the stream on which a parameter was used before.
         aliases = [each.detach().requires_grad_(each.requires_grad) for each in parameters]
@@ -106,7 +107,7 @@ class RecordedFunction:
             # The graph is kept, because a record runs a program more than once.
             found = torch.autograd.grad(values, leaves, self._slopes, retain_graph=True, allow_unused=True)
             used[:] = [each is not None for each in found]
-            return [each for each in found if each is not None]
+            return [each.contiguous() for each in found if each is not None]
 
         used: list[bool] = []
         self._values, self._recompute = record(compute)
@@ -127,6 +128,7 @@ class RecordedFunction:
         """All values for given inputs, and those of them that have no gradient."""
         _copy(self._inputs, inputs)
         self._recompute()
+        self.calls += 1
         values = [each.detach() for each in self._values]
         return values, [each for each, smooth in zip(values, self._differentiable, strict=True) if not smooth]
 
@@ -145,15 +147,17 @@ class RecordedFunction:
 class _Repeated(torch.autograd.Function):
     @staticmethod
     def forward(ctx, recorded: RecordedFunction, *tensors: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        ctx.recorded = recorded
-        ctx.set_materialize_grads(False)
         values, constant = recorded.values(tensors)
+        ctx.recorded, ctx.call = recorded, recorded.calls
+        ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*constant)
         return tuple(values)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, *slopes: Tensor | None) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if ctx.call != ctx.recorded.calls:
+            raise RuntimeError("a recorded function was called again before the gradient of its last call was taken")
         return None, *ctx.recorded.gradients(slopes)
 
 

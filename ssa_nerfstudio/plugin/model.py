@@ -25,13 +25,13 @@ from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_met
 from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
 from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
 from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.regularizers import regularizers
 from ssa_nerfstudio.plugin.training.seed_points import color_parameters, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
-from ssa_nerfstudio.rasterization import rasterizer
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 
@@ -70,6 +70,7 @@ class SSASplatfactoModel(SplatfactoModel):
             self.gauss_params["features_dc"] = Parameter(color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
+        self._draw = SplatRenderer(self.config.rasterizer)
         self._recorded = RecordedCalls(CapturedPrograms)
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
@@ -184,25 +185,17 @@ class SSASplatfactoModel(SplatfactoModel):
             if not inside.any():
                 return self.get_empty_outputs(width, height, self.background_color)
             gaussians = {name: values[inside] for name, values in gaussians.items()}
-        colors, sh_degree = gaussians["features_dc"], None
+        sh_degree = None
         if self.config.sh_degree > 0:
             sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
-            colors = torch.cat([colors[:, None], gaussians["features_rest"]], dim=1)
-        else:
-            colors = torch.sigmoid(colors)
         with_depth = self.config.output_depth_during_training or not self.training
-        render, alpha, self.info = rasterizer(self.config.rasterizer, self.device)(
-            means=gaussians["means"],
-            quats=gaussians["quats"],
-            scales=torch.exp(gaussians["scales"]),
-            opacities=torch.sigmoid(gaussians["opacities"]).squeeze(-1),
-            colors=colors,
-            viewmats=self._view_matrix(camera),
-            Ks=intrinsics(camera, reduction),
-            width=width,
-            height=height,
+        render, alpha, self.info = self._draw(
+            gaussians,
+            self._view_matrix(camera),
+            intrinsics(camera, reduction),
+            width,
+            height,
             near_plane=self._near_plane,
-            packed=False,
             sh_degree=sh_degree,
             render_mode="RGB+ED" if with_depth else "RGB",
             absgrad=self.strategy.absgrad,

@@ -7,6 +7,7 @@ view matrix with `torch.inverse`, which waits for the device at every frame. A r
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from gsplat import (
@@ -22,10 +23,21 @@ from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, make_rasterization
 
 
-def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Render with gsplat's kernels. See `interface.Render`."""
+class Projected(NamedTuple):
+    """What blending needs of N Gaussians in C cameras."""
+
+    means2d: Tensor  # [C, N, 2], pixels
+    conics: Tensor  # [C, N, 3]
+    channels: Tensor  # [C, N, X], as `render_mode` says
+    alphas: Tensor  # [C, N]
+    depths: Tensor  # [C, N], world units
+    radii: Tensor  # [C, N] int32, pixels
+
+
+def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> Projected:
+    """Project with gsplat's kernels; all shapes follow from those of the arguments."""
     means, quats, scales, opacities, colors = gaussians
-    viewmats, Ks, width, height, backgrounds = cameras
+    viewmats, Ks, width, height, _ = cameras
     n_cameras = viewmats.shape[0]
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         means,
@@ -57,9 +69,16 @@ def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tu
     if options.render_mode != "RGB":
         depth_only = options.render_mode in ("D", "ED")
         channels = depths[..., None] if depth_only else torch.cat([rgb, depths[..., None]], dim=-1)
-        if backgrounds is not None:
-            backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
-            backgrounds = backgrounds[:, -channels.shape[-1] :]
+    return Projected(means2d, conics, channels, alphas.contiguous(), depths, radii)
+
+
+def blend(projected: Projected, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor]:
+    """Blend with gsplat's kernels: render [C, H, W, X] and alpha [C, H, W, 1]. It reads the device once."""
+    means2d, conics, channels, alphas, depths, radii = projected
+    n_cameras, width, height, backgrounds = len(means2d), cameras.width, cameras.height, cameras.backgrounds
+    if options.render_mode != "RGB" and backgrounds is not None:
+        backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
+        backgrounds = backgrounds[:, -channels.shape[-1] :]
     tiles = math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, *tiles, packed=False, n_cameras=n_cameras)
     offsets = isect_offset_encode(isect_ids, n_cameras, *tiles)
@@ -67,7 +86,7 @@ def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tu
         means2d,
         conics,
         channels,
-        alphas.contiguous(),
+        alphas,
         width,
         height,
         TILE,
@@ -78,7 +97,13 @@ def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tu
     )
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], dim=-1)
-    return image, alpha, radii, means2d
+    return image, alpha
+
+
+def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Render with gsplat's kernels. See `interface.Render`."""
+    projected = project(gaussians, cameras, options)
+    return *blend(projected, cameras, options), projected.radii, projected.means2d
 
 
 rasterization = make_rasterization(render)

@@ -60,6 +60,20 @@ implementation leaves their summed magnitudes in `means2d.absgrad`.
 Rasterization = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
 
 
+def info_of(radii: Tensor, means2d: Tensor, width: int, height: int) -> dict[str, Any]:
+    """What gsplat's densification strategies read, as `rasterization` in `make_rasterization` describes it."""
+    return {
+        "camera_ids": None,
+        "gaussian_ids": None,
+        "radii": radii,
+        "means2d": means2d,
+        "width": width,
+        "height": height,
+        "tile_size": constants.TILE,
+        "n_cameras": len(means2d),
+    }
+
+
 def make_rasterization(render: Render) -> Rasterization:
     """Wrap an implementation in gsplat's interface; its signature, documentation and checks are in this one place."""
 
@@ -130,16 +144,6 @@ def make_rasterization(render: Render) -> Rasterization:
                 antialiased=rasterize_mode == "antialiased",
             ),
         )
-        info = {
-            "camera_ids": None,
-            "gaussian_ids": None,
-            "radii": radii,
-            "means2d": means2d,
-            "width": width,
-            "height": height,
-            "tile_size": tile_size,
-            "n_cameras": viewmats.shape[0],
-        }
-        return image, alpha, info
+        return image, alpha, info_of(radii, means2d, width, height)
 
     return rasterization

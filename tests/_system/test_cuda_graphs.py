@@ -69,6 +69,16 @@ def test_a_value_that_nothing_depends_on_has_no_slope(device):
         torch.testing.assert_close(found, mixture.weights.grad)
 
 
+def test_a_gradient_after_another_call_is_refused():
+    mixture = Mixture("cpu")
+    inputs = mixture.inputs()
+    recorded = RecordedFunction(mixture, inputs, [mixture.weights], run_again())
+    first = recorded(*inputs)[0]
+    recorded(*inputs)
+    with pytest.raises(RuntimeError, match="called again"):
+        first.backward()
+
+
 class Counted:
     """Counts the recordings that are made."""
 

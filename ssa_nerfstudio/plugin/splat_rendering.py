@@ -1,0 +1,94 @@
+"""From splatfacto's parameters to a render; while training on CUDA, all before the blending is one CUDA graph.
+
+What is recorded are the activations of the parameters, the projection and the colors. How many tiles the Gaussians
+cover differs from view to view, so sorting and blending cannot be. A refinement makes other Gaussians, and with them
+new recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable
+from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
+from ssa_nerfstudio.rasterization.constants import EPS2D, FAR_PLANE
+from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, info_of
+
+PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
+"""Of the Gaussians, by the names that splatfacto gives them."""
+
+
+class SplatRenderer:
+    """Renders Gaussians of which the parameters are given as they are learned."""
+
+    def __init__(self, name: RasterizerName) -> None:
+        self._name: RasterizerName = name
+        self.projections = RecordedCalls(CapturedPrograms)
+
+    def __call__(
+        self,
+        parameters: Mapping[str, Tensor],
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        **options: Any,
+    ) -> tuple[Tensor, Tensor, dict[str, Any]]:
+        """Render as `interface.make_rasterization` describes.
+
+        Args:
+            parameters: of N Gaussians, at least `PARAMETERS`.
+            viewmats, Ks, width, height: cameras.
+            options: near_plane, sh_degree, render_mode, absgrad and rasterize_mode.
+        """
+        device = parameters["means"].device
+        gsplat = device.type == "cuda" and self._name in ("auto", "gsplat")
+        if gsplat and torch.is_grad_enabled() and options["render_mode"] == "RGB" and graphs_are_usable():
+            antialiased = options.pop("rasterize_mode") == "antialiased"
+            settings = RenderOptions(
+                far_plane=FAR_PLANE, radius_clip=0.0, eps2d=EPS2D, antialiased=antialiased, **options
+            )
+            return render_recorded(self.projections, parameters, Cameras(viewmats, Ks, width, height, None), settings)
+        gaussians = activated(parameters, options["sh_degree"] is not None)
+        draw = rasterizer(self._name, device)
+        return draw(**gaussians._asdict(), viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
+
+
+def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussians:
+    """Gaussians of splatfacto's parameters, of which `features_rest` counts only with harmonics."""
+    means, quats, scales, opacities, constant, rest = (parameters[name] for name in PARAMETERS)
+    colors = torch.cat([constant[:, None], rest], dim=1) if with_harmonics else torch.sigmoid(constant)
+    return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacities).squeeze(-1), colors)
+
+
+def render_recorded(
+    calls: RecordedCalls, parameters: Mapping[str, Tensor], cameras: Cameras, options: RenderOptions
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Render with gsplat's kernels, the projection as a recording.
+
+    Args:
+        calls: of this training.
+        parameters: of N Gaussians, `PARAMETERS`.
+        cameras: without a background.
+        options: with `render_mode` RGB.
+
+    Returns:
+        As of `interface.make_rasterization`.
+    """
+    from ssa_nerfstudio.rasterization import cuda
+
+    def compute(viewmats: Tensor, Ks: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
+        gaussians = activated(dict(zip(PARAMETERS, values, strict=True)), options.sh_degree is not None)
+        projected = cuda.project(gaussians, cameras._replace(viewmats=viewmats, Ks=Ks), options)
+        # Depths sort, and are no part of the picture.
+        return tuple(projected._replace(depths=projected.depths.detach()))
+
+    kind = cameras.width, cameras.height, *vars(options).values()
+    values = calls(compute, [cameras.viewmats, cameras.Ks], [parameters[name] for name in PARAMETERS], kind)
+    projected = cuda.Projected(*values)
+    image, alpha = cuda.blend(projected, cameras, options)
+    return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)

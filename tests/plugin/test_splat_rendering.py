@@ -1,0 +1,95 @@
+"""A training view that is rendered with a recorded projection against one that launches every kernel by itself."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.plugin.splat_rendering import PARAMETERS, SplatRenderer, activated
+
+WIDTH, HEIGHT = 96, 64
+
+
+def parameters(count: int, device: str) -> dict[str, Tensor]:
+    """splatfacto's, of a random scene."""
+    generator = torch.Generator().manual_seed(count)
+    means = torch.rand(count, 3, generator=generator) * 2 - 1
+    values = {
+        "means": means + torch.tensor([0.0, 0.0, 4.0]),
+        "quats": torch.randn(count, 4, generator=generator),
+        "scales": torch.rand(count, 3, generator=generator) - 3.5,
+        "opacities": torch.randn(count, 1, generator=generator),
+        "features_dc": torch.randn(count, 3, generator=generator),
+        "features_rest": 0.2 * torch.randn(count, 15, 3, generator=generator),
+    }
+    return {name: torch.nn.Parameter(value.to(device)) for name, value in values.items()}
+
+
+def cameras(view: int, device: str) -> tuple[Tensor, Tensor]:
+    pose = torch.eye(4)
+    pose[0, 3], pose[1, 3] = 0.1 * view, -0.05 * view
+    K = torch.tensor([[80.0 + view, 0.0, WIDTH / 2], [0.0, 80.0, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    return pose[None].to(device), K[None].to(device)
+
+
+def outcome(renderer: SplatRenderer, given: dict[str, Tensor], view: int, sh_degree: int | None, mode: str):
+    device = str(given["means"].device)
+    for value in given.values():
+        value.grad = None
+    options = {
+        "near_plane": 0.01,
+        "sh_degree": sh_degree,
+        "render_mode": "RGB",
+        "absgrad": True,
+        "rasterize_mode": mode,
+    }
+    image, alpha, info = renderer(given, *cameras(view, device), WIDTH, HEIGHT, **options)
+    info["means2d"].retain_grad()
+    weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(view)).to(device)
+    ((image * weights).sum() + alpha.square().sum()).backward()
+    visible = info["radii"] > 0
+    found = {
+        "image": image,
+        "alpha": alpha,
+        "radii": visible,
+        "means2d": torch.where(visible[..., None], info["means2d"], 0),
+    }
+    found |= {"absgrad": info["means2d"].absgrad, "gradient of means2d": info["means2d"].grad}
+    found |= {f"gradient of {name}": value.grad for name, value in given.items() if value.grad is not None}
+    return {name: value.detach().float().clone() for name, value in found.items()}, info
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs CUDA")
+@pytest.mark.parametrize(("sh_degree", "mode"), [(3, "classic"), (0, "antialiased"), (None, "classic")])
+def test_a_recorded_projection_draws_the_same_with_the_same_gradients(monkeypatch, sh_degree, mode):
+    given = parameters(500, "cuda")
+    renderer = SplatRenderer("auto")
+    for view in range(8):
+        found = []
+        for graphs in ("0", "1"):
+            monkeypatch.setenv("SSA_CUDA_GRAPHS", graphs)
+            found.append(outcome(renderer, given, view, sh_degree, mode)[0])
+        assert found[0].keys() == found[1].keys()
+        for name, expected in found[0].items():
+            difference = (found[1][name] - expected).norm() / expected.norm().clamp_min(1e-20)
+            assert difference <= 1e-4, (name, view)  # gsplat adds gradients up in any order
+        with torch.no_grad():
+            for value in given.values():
+                value += 0.01 * torch.randn_like(value)
+        if view == 3:  # as a refinement does
+            given = {name: torch.nn.Parameter(value.detach()[::2].clone()) for name, value in given.items()}
+    assert all(each is not None for each in renderer.projections._known.values())
+
+
+def test_what_is_drawn_is_the_activated_scene():
+    given = parameters(50, "cpu")
+    for with_harmonics in (True, False):
+        gaussians = activated(given, with_harmonics)
+        assert gaussians.means is given["means"]
+        torch.testing.assert_close(gaussians.scales.log(), given["scales"])
+        torch.testing.assert_close(gaussians.opacities.logit(), given["opacities"][:, 0])
+        colors = gaussians.colors if with_harmonics else gaussians.colors.logit()
+        constant = colors[:, 0] if with_harmonics else colors
+        torch.testing.assert_close(constant, given["features_dc"])
+    assert set(PARAMETERS) == set(given)
