@@ -11,6 +11,7 @@ import logging
 import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import torch
@@ -27,7 +28,12 @@ _LOG = logging.getLogger(__name__)
 
 def graphs_are_usable() -> bool:
     """Whether there is CUDA, and SSA_CUDA_GRAPHS is not 0."""
-    return torch.cuda.is_available() and os.environ.get("SSA_CUDA_GRAPHS", "1") != "0"
+    return os.environ.get("SSA_CUDA_GRAPHS", "1") != "0" and _has_cuda()
+
+
+@cache
+def _has_cuda() -> bool:
+    return torch.cuda.is_available()
 
 
 class CapturedPrograms:
@@ -41,10 +47,14 @@ class CapturedPrograms:
         self._stream = torch.cuda.Stream()
 
     def __call__(self, program: Program) -> tuple[list[Tensor], Callable[[], object]]:
-        """Run a program once, then capture it: libraries and kernels must be loaded before."""
-        graph = torch.cuda.CUDAGraph()
+        """Run a program once, which loads its kernels and libraries, and capture it."""
         with self._aside():
             program()
+        return self.capture(program)
+
+    def capture(self, program: Program) -> tuple[list[Tensor], Callable[[], object]]:
+        """Capture a program without running it; it must have run before."""
+        graph = torch.cuda.CUDAGraph()
         with self._aside():
             # Not torch.cuda.graph, which also collects garbage and empties the cache, a tenth of a second each time.
             # Other threads (the viewer's) may use CUDA meanwhile.
@@ -210,9 +220,42 @@ class RecordedCalls:
                 recorded = self._known[kind] = RecordedFunction(function, inputs, parameters, self._record)
             except RuntimeError as error:
                 self._failed, self._known = True, {}
-                _LOG.warning(f"CUDA graphs cannot be used, steps take longer: {str(error).splitlines()[0]}")
+                _warn(error)
                 return function(*inputs, *parameters)
         return recorded(*inputs)
+
+
+class RecordedChanges:
+    """Runs programs that change tensors in place: plainly at first, from the second time on as CUDA graphs."""
+
+    def __init__(self, limit: int = 8) -> None:
+        """Record nothing yet; at most `limit` programs are remembered."""
+        self._limit = limit
+        self._record: CapturedPrograms | None = None
+        self._known: dict[Hashable, Callable[[], object] | None] = {}
+        self._failed = False
+
+    def __call__(self, program: Callable[[], None], key: Hashable) -> None:
+        """Run a program once.
+
+        Args:
+            program: it launches the same kernels whenever the key is the same.
+            key: the addresses and sizes of all tensors that it reads or changes, and what else it depends on.
+        """
+        repeat = self._known.get(key)
+        if repeat is None and key in self._known and not self._failed:
+            try:
+                self._record = self._record or CapturedPrograms()
+                _, repeat = self._record.capture(lambda: program() or [])
+                self._known[key] = repeat
+            except RuntimeError as error:
+                self._failed = True
+                _warn(error)
+        elif repeat is None:
+            self._known[key] = None
+            if len(self._known) > self._limit:
+                del self._known[next(iter(self._known))]
+        (repeat or program)()
 
 
 @contextmanager
@@ -227,6 +270,10 @@ def parameters_replaced(module: nn.Module, tensors: Sequence[Tensor]) -> Iterato
     finally:
         for (each, name), parameter in zip(places, held, strict=True):
             each._parameters[name] = parameter
+
+
+def _warn(error: RuntimeError) -> None:
+    _LOG.warning(f"CUDA graphs cannot be used, steps take longer: {str(error).splitlines()[0]}")
 
 
 def _copy(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:

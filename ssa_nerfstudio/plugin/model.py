@@ -234,12 +234,12 @@ class SSASplatfactoModel(SplatfactoModel):
 
     def _losses_are_recorded(self, with_depth: bool) -> bool:
         """Whether this step computes from the render to the loss in one launch."""
-        return self._nothing_else_is_read(with_depth) and self.device.type == "cuda" and graphs_are_usable()
+        return self._can_be_recorded(with_depth) and self.device.type == "cuda" and graphs_are_usable()
 
-    def _nothing_else_is_read(self, with_depth: bool) -> bool:
-        """Whether only `_photo_losses` reads the pictures of this step, and they need no parameter of the view."""
+    def _can_be_recorded(self, with_depth: bool) -> bool:
+        """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
         settings = with_depth or self.config.use_bilateral_grid or self.exposure is not None
-        return self.training and self.recordable and not settings and self.step % self.metrics_every != 0
+        return self.training and self.recordable and not settings
 
     def _view_matrix(self, camera: Cameras) -> Tensor:
         """World to camera [1, 4, 4], with the camera optimizer's correction while training."""
@@ -273,14 +273,14 @@ class SSASplatfactoModel(SplatfactoModel):
         if mask is not None:
             target, shown = target * mask, shown * mask
         losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
-        learned = self.artifacts.learned() if self.training else []
-        if learned and self.config.sparsity != "off":
-            terms = [sparsity_loss(overlay.opacity(), overlay.evidence, self.config.sparsity) for overlay in learned]
+        if self._sparsity_counts():
+            learned, kind = self.artifacts.learned(), self.config.sparsity
+            terms = [sparsity_loss(overlay.opacity(), overlay.evidence, kind) for overlay in learned]
             losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
         return losses
 
     def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
-        """`_photo_losses` of a training view of which only the splats were drawn, as one CUDA graph."""
+        """`_photo_losses` of a view of which only the splats were drawn, as one CUDA graph; draws the rest, too."""
         photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
         splats = [drawn[name] for name in ("color", "accumulation", "background")]
 
@@ -288,15 +288,22 @@ class SSASplatfactoModel(SplatfactoModel):
             rgb = clean_image(color, accumulation, background, 1.0)
             shown = {"rgb": rgb, "accumulation": accumulation, "background": background}
             with parameters_replaced(self.artifacts, others[len(photo) :]):
-                losses = self._photo_losses(self._with_photo(shown, drawn["view"]), dict(zip(photo, others)))  # noqa: B905
-            return tuple(losses.values())
+                shown = self._with_photo(shown, drawn["view"])
+                losses = self._photo_losses(shown, dict(zip(photo, others)))  # noqa: B905
+            pictures = (shown[name].detach() for name in ("rgb", "composite") if name in shown)
+            return *losses.values(), *pictures
 
         view = drawn["view"] if len(self.artifacts) else None
         kind = None if view is None else self.artifacts.group_of_view(view), tuple(photo)
-        values = self._recorded(
-            compute, [*splats, *photo.values()], list(self.artifacts.parameters()), kind, self._get_downscale_factor()
-        )
-        return dict(zip(("main_loss", "sparsity"), values))  # noqa: B905 - where there is a second
+        parameters, reduction = list(self.artifacts.parameters()), self._get_downscale_factor()
+        values = self._recorded(compute, [*splats, *photo.values()], parameters, kind, reduction)
+        names = ["main_loss", *["sparsity"] * self._sparsity_counts(), "rgb", "composite"]
+        found = dict(zip(names, values))  # noqa: B905 - there may be no composite
+        drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
+        return found
+
+    def _sparsity_counts(self) -> bool:
+        return self.training and self.config.sparsity != "off" and bool(self.artifacts.learned())
 
     def loss_mask(self, shown: Tensor, target: Tensor, batch: dict) -> Tensor | None:
         """Weight [H, W, 1] of every pixel in the photometric loss: the dataset's mask, None where there is none."""

@@ -128,6 +128,13 @@ class SSAPipeline(VanillaPipeline):
         seeds = self.model.seed_points
         return None if seeds is None else seeds[0]
 
+    def get_train_loss_dict(self, step: int) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+        """Outputs, losses and metrics of a training step; metrics last, because recorded losses bring the pictures."""
+        camera, batch = self.datamanager.next_train(step)
+        outputs = self._model(camera)
+        losses = self.model.get_loss_dict(outputs, batch)
+        return outputs, losses, self.model.get_metrics_dict(outputs, batch)
+
     def get_average_eval_image_metrics(
         self, step: int | None = None, output_path: Path | None = None, get_std: bool = False
     ) -> dict[str, Any]:

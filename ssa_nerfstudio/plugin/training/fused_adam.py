@@ -47,12 +47,13 @@ class FusedAdam(torch.optim.Adam):
         """Numbers of steps, scalars on the device, of the parameters that have a gradient."""
         return [self._state_of(p)["step"] for group in self.param_groups for p in group["params"] if p.grad is not None]
 
-    def update(self, skipped: Tensor | None, scale: Tensor | None = None) -> None:
+    def update(self, skipped: Tensor | None, scale: Tensor | None = None, rate: Tensor | None = None) -> None:
         """Take a step that is counted already: `step` without torch's hooks and profiler marks. Under `no_grad`.
 
         Args:
             skipped: scalar; where it is 1, nothing changes.
             scale: scalar by which the gradients are too large.
+            rate: scalar on the device, in place of the groups' learning rates.
         """
         for group in self.param_groups:
             parameters = [p for p in group["params"] if p.grad is not None]
@@ -66,7 +67,7 @@ class FusedAdam(torch.optim.Adam):
                 [state["exp_avg_sq"] for state in states],
                 [],
                 [state["step"] for state in states],
-                lr=group["lr"],
+                lr=group["lr"] if rate is None else rate,
                 beta1=group["betas"][0],
                 beta2=group["betas"][1],
                 weight_decay=group["weight_decay"],
@@ -76,6 +77,16 @@ class FusedAdam(torch.optim.Adam):
                 grad_scale=scale,
                 found_inf=skipped,
             )
+
+    def addresses(self) -> list[int]:
+        """Where everything is that a step reads or changes."""
+        found = []
+        for group in self.param_groups:
+            for p in group["params"]:
+                if p.grad is not None:
+                    found += [p.numel(), p.data_ptr(), p.grad.data_ptr()]
+                    found += [each.data_ptr() for each in self._state_of(p).values()]
+        return found
 
     def _state_of(self, parameter: Tensor) -> dict[str, Tensor]:
         state = self.state[parameter]

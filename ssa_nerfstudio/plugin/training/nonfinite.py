@@ -60,6 +60,7 @@ class NonFiniteGuard:
         self._optimizers: Mapping[str, torch.optim.Optimizer] = {}
         self._loss: Tensor | None = None
         self._verdicts: list[Verdict] = []
+        self._factors: tuple[Tensor, ...] = ()
         self._judged = 0
         self._run_length, self._run_start = 0, 0
 
@@ -71,24 +72,35 @@ class NonFiniteGuard:
             optimizers: all of them by name, also those that only accumulate gradients at this step. No two gradients
                 may share memory.
         """
+        verdict = self.next_verdict(loss, optimizers)
+        assert self._loss is not None
+        self.search(self._loss, verdict)
+        return verdict
+
+    def next_verdict(self, loss: Tensor, optimizers: Mapping[str, torch.optim.Optimizer]) -> Verdict:
+        """Where the verdict on this step belongs, for the host to read it; `judge` without judging."""
         if self._judged == 0:
             # New storage, because what the previous window returned may still be in use on the device.
             rows = loss.new_zeros(2, CHECK_EVERY, dtype=torch.float32, requires_grad=False)
-            self._factors = loss.new_tensor([SQUARE_LIMIT, 1 / SQUARE_LIMIT], dtype=torch.float32).unbind()
+            if not self._factors or self._factors[0].device != loss.device:  # recorded steps know where they are
+                self._factors = loss.new_tensor([SQUARE_LIMIT, 1 / SQUARE_LIMIT], dtype=torch.float32).unbind()
             self._taken, self._skipped = rows
             self._verdicts = [Verdict(*pair) for pair in zip(*(row.unbind() for row in rows), strict=True)]
         self._optimizers, self._loss = optimizers, loss.detach().float()
         verdict = self._verdicts[self._judged]
         self._judged += 1
+        return verdict
+
+    def search(self, loss: Tensor, verdict: Verdict) -> None:
+        """Write a verdict whose `skipped` was 0, by a loss [] in float32 and the gradients of the last optimizers."""
         # Densification replaces parameters, so the list is rebuilt at every step.
-        values = [self._loss, *(p.grad for _, p in _parameters(optimizers) if p.grad is not None)]
+        values = [loss, *(p.grad for _, p in _parameters(self._optimizers) if p.grad is not None)]
         # One kernel over a list of tensors sets `skipped` where a value is not finite, and multiplies all of them. The
         # second call finds what overflowed in the first, and restores all other values: powers of two round nothing.
         search = torch._amp_foreach_non_finite_check_and_unscale_  # pyright: ignore[reportPrivateImportUsage]
         for factor in self._factors:
             search(values, verdict.skipped, factor)
         torch.logical_not(verdict.skipped, out=verdict.taken)
-        return verdict
 
     def mask_densification(self, info: dict[str, Any]) -> None:
         """Keep the step that was judged last out of the densification, if it was skipped.

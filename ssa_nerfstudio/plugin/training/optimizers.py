@@ -10,8 +10,10 @@ from nerfstudio.engine.optimizers import Optimizers
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam, count_steps
+from ssa_nerfstudio._system.cuda_graphs import graphs_are_usable
+from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam
 from ssa_nerfstudio.plugin.training.nonfinite import NonFiniteGuard
+from ssa_nerfstudio.plugin.training.recorded_steps import RecordedSteps, take_steps
 
 
 class JointOptimizers(Optimizers):
@@ -32,6 +34,7 @@ class JointOptimizers(Optimizers):
         """
         super().__init__(config, param_groups)
         self.guard = guard
+        self._recorded = RecordedSteps()
         for optimizer in self.optimizers.values():
             if isinstance(optimizer, FusedAdam):
                 # torch's schedulers warn unless `step` was called; `update` replaces it.
@@ -57,6 +60,9 @@ class JointOptimizers(Optimizers):
             super().optimizer_scaler_step_some(grad_scaler, list(groups))  # pyright: ignore[reportArgumentType]
             return
         optimizers = [self.optimizers[name] for name in groups if self._has_gradient(name)]
+        if graphs_are_usable() and not grad_scaler.is_enabled() and self._can_be_recorded(groups):
+            self._recorded(optimizers, loss, self.guard, self.optimizers)  # pyright: ignore[reportArgumentType]
+            return
         if grad_scaler.is_enabled():
             for optimizer in optimizers:
                 grad_scaler.unscale_(optimizer)
@@ -66,15 +72,18 @@ class JointOptimizers(Optimizers):
             if max_norm is not None:
                 torch.nn.utils.clip_grad_norm_(self.parameters[name], max_norm)
         fused = [optimizer for optimizer in optimizers if isinstance(optimizer, FusedAdam)]
-        with torch.no_grad():
-            counters = [counter for optimizer in fused for counter in optimizer.counters()]
-            count_steps(counters, 1 if verdict is None else verdict.taken)
-            for optimizer in fused:
-                optimizer.update(None if verdict is None else verdict.skipped)
+        take_steps(fused, verdict)
         for optimizer in optimizers:
             # Other optimizers cannot skip a step on the device, so the host waits for the verdict.
             if not isinstance(optimizer, FusedAdam) and (verdict is None or verdict.taken.item()):
                 optimizer.step()
+
+    def _can_be_recorded(self, groups: Sequence[str]) -> bool:
+        """Whether a step of these groups is the same at all of its kind, and no gradient waits for a later one."""
+        learned = [name for name in self.optimizers if self._has_gradient(name)]
+        return all(
+            name in groups and self.config[name]["optimizer"].max_norm is None for name in learned
+        ) and RecordedSteps.fits([self.optimizers[name] for name in learned])
 
     def _has_gradient(self, name: str) -> bool:
         return any(p.grad is not None for group in self.optimizers[name].param_groups for p in group["params"])

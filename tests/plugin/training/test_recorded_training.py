@@ -47,7 +47,7 @@ def set_up(tiny_scene, tmp_path_factory, configure_training):
 
 def record_losses(patch: pytest.MonkeyPatch, recorded: bool) -> None:
     """Record losses wherever they can be, or nowhere."""
-    possible = SSASplatfactoModel._nothing_else_is_read
+    possible = SSASplatfactoModel._can_be_recorded
     patch.setattr(SSASplatfactoModel, "_losses_are_recorded", lambda self, depth: recorded and possible(self, depth))
 
 
@@ -97,3 +97,18 @@ def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, se
             assert difference <= (0 if device == "cpu" else 1e-4), (name, step)  # gsplat adds in any order
     recordings = [each for each in model._recorded._known.values() if each is not None]
     assert len(recordings) == 1
+
+
+def test_recorded_steps_log_what_plain_ones_do(set_up, monkeypatch):
+    logged = []
+    for recorded in (False, True):
+        record_losses(monkeypatch, recorded)
+        trainer = set_up("cpu", {})
+        trainer.pipeline.model.step_cb(trainer.optimizers, 20)
+        trainer.pipeline.train()
+        for _ in range(3):  # the third is a recording
+            loss, losses, metrics = trainer.train_iteration(20)
+        logged.append({"loss": loss, **losses, **metrics})
+        monkeypatch.undo()
+    assert "composite_psnr" in logged[0]
+    assert logged[0] == logged[1]
