@@ -134,6 +134,8 @@ def _write_profile(trainer: Any, path: Path) -> None:
         f"aten operations a step: {sum(e.count for e in found if e.key.startswith('aten::')) / steps:.1f}",
         f"host, own time of all operations: {sum(e.self_cpu_time_total for e in found) / 1e3 / steps:.3f} ms a step",
         f"device busy: {busy / 1e3 / steps:.3f} ms a step",
+        f"device memory at its peak: {torch.cuda.max_memory_allocated() / 2**20:.0f} MiB in use, "
+        f"{torch.cuda.max_memory_reserved() / 2**20:.0f} MiB reserved",
         *(f"{name}: {count:.2f} a step" for name, count in sorted(runtime.items(), key=lambda item: -item[1])),
         "",
         found.table(sort_by="self_cpu_time_total", row_limit=40, max_name_column_width=80),
