@@ -1,8 +1,8 @@
-"""From splatfacto's parameters to a render; while training on CUDA, all before the blending is one CUDA graph.
+"""From splatfacto's parameters to a render; while training on CUDA, the projection is one CUDA graph.
 
-What is recorded are the activations of the parameters, the projection and the colors. How many tiles the Gaussians
-cover differs from view to view, so sorting and blending cannot be. A refinement makes other Gaussians, and with them
-new recordings.
+What is recorded are the activations of the parameters and the projection. Spherical harmonics cannot be (`cuda.shade`),
+nor can sorting and blending: the number of tiles that the Gaussians cover differs from view to view. A refinement makes
+other Gaussians, and with them new recordings.
 """
 
 from __future__ import annotations
@@ -85,10 +85,12 @@ def render_recorded(
         gaussians = activated(dict(zip(PARAMETERS, values, strict=True)), options.sh_degree is not None)
         projected = cuda.project(gaussians, cameras._replace(viewmats=viewmats, Ks=Ks), options)
         # Depths sort, and are no part of the picture.
-        return tuple(projected._replace(depths=projected.depths.detach()))
+        projected = projected._replace(depths=projected.depths.detach())
+        return gaussians.colors, *(each for each in projected if each is not None)
 
     kind = cameras.width, cameras.height, *vars(options).values()
-    values = calls(compute, [cameras.viewmats, cameras.Ks], [parameters[name] for name in PARAMETERS], kind)
-    projected = cuda.Projected(*values)
-    image, alpha = cuda.blend(projected, cameras, options)
+    views, learned = [cameras.viewmats, cameras.Ks], [parameters[name] for name in PARAMETERS]
+    colors, *rest = calls(compute, views, learned, kind)
+    projected = cuda.Projected(*rest) if options.sh_degree is not None else cuda.Projected(*rest, None)
+    image, alpha = cuda.blend(projected, cuda.shade(projected, colors, options), cameras, options)
     return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)

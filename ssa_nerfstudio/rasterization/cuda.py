@@ -28,15 +28,15 @@ class Projected(NamedTuple):
 
     means2d: Tensor  # [C, N, 2], pixels
     conics: Tensor  # [C, N, 3]
-    channels: Tensor  # [C, N, X], as `render_mode` says
     alphas: Tensor  # [C, N]
     depths: Tensor  # [C, N], world units
     radii: Tensor  # [C, N] int32, pixels
+    directions: Tensor | None  # [C, N, 3] from the cameras, where colors are spherical harmonics
 
 
 def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> Projected:
-    """Project with gsplat's kernels; all shapes follow from those of the arguments."""
-    means, quats, scales, opacities, colors = gaussians
+    """Project with gsplat's kernels, all on the current stream; shapes follow from those of the arguments."""
+    means, quats, scales, opacities, _ = gaussians
     viewmats, Ks, width, height, _ = cameras
     n_cameras = viewmats.shape[0]
     radii, means2d, depths, conics, compensations = fully_fused_projection(
@@ -57,24 +57,35 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> P
     alphas = opacities.expand(n_cameras, -1)
     if compensations is not None:
         alphas = alphas * compensations
-    if options.sh_degree is None:
-        rgb = colors.expand(n_cameras, -1, -1)
-    else:
+    directions = None
+    if options.sh_degree is not None:
         centers = -(viewmats[:, :3, :3].transpose(1, 2) @ viewmats[:, :3, 3:])  # [C, 3, 1]
         directions = means - centers.transpose(1, 2)
-        coefficients = colors.expand(n_cameras, -1, -1, -1)
-        rgb = spherical_harmonics(options.sh_degree, directions, coefficients, masks=radii > 0)
+    return Projected(means2d, conics, alphas.contiguous(), depths, radii, directions)
+
+
+def shade(projected: Projected, colors: Tensor, options: RenderOptions) -> Tensor:
+    """Channels [C, N, X] of projected Gaussians with given colors, as `render_mode` says.
+
+    gsplat 1.4.0 evaluates spherical harmonics on the default stream, whatever the current one is
+    (cuda/csrc/compute_sh_fwd.cu:60, compute_sh_bwd.cu:80), so a CUDA graph does not capture them.
+    """
+    if projected.directions is None or options.sh_degree is None:
+        rgb = colors.expand(len(projected.radii), -1, -1)
+    else:
+        coefficients = colors.expand(len(projected.radii), -1, -1, -1)
+        masks = projected.radii > 0
+        rgb = spherical_harmonics(options.sh_degree, projected.directions, coefficients, masks=masks)
         rgb = torch.clamp_min(rgb + 0.5, 0.0)
-    channels = rgb
-    if options.render_mode != "RGB":
-        depth_only = options.render_mode in ("D", "ED")
-        channels = depths[..., None] if depth_only else torch.cat([rgb, depths[..., None]], dim=-1)
-    return Projected(means2d, conics, channels, alphas.contiguous(), depths, radii)
+    if options.render_mode == "RGB":
+        return rgb
+    depths = projected.depths[..., None]
+    return depths if options.render_mode in ("D", "ED") else torch.cat([rgb, depths], dim=-1)
 
 
-def blend(projected: Projected, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor]:
+def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor]:
     """Blend with gsplat's kernels: render [C, H, W, X] and alpha [C, H, W, 1]. It reads the device once."""
-    means2d, conics, channels, alphas, depths, radii = projected
+    means2d, conics, alphas, depths, radii, _ = projected
     n_cameras, width, height, backgrounds = len(means2d), cameras.width, cameras.height, cameras.backgrounds
     if options.render_mode != "RGB" and backgrounds is not None:
         backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
@@ -103,7 +114,8 @@ def blend(projected: Projected, cameras: Cameras, options: RenderOptions) -> tup
 def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Render with gsplat's kernels. See `interface.Render`."""
     projected = project(gaussians, cameras, options)
-    return *blend(projected, cameras, options), projected.radii, projected.means2d
+    channels = shade(projected, gaussians.colors, options)
+    return *blend(projected, channels, cameras, options), projected.radii, projected.means2d
 
 
 rasterization = make_rasterization(render)

@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import pytest
 import torch
+from gsplat.cuda._torch_impl import _fully_fused_projection as projection
+from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci as quat_scale_to_covar_preci
+from gsplat.cuda._torch_impl import _spherical_harmonics as harmonics
+from recordings import run_again
 from torch import Tensor
 
-from ssa_nerfstudio.plugin.splat_rendering import PARAMETERS, SplatRenderer, activated
+from ssa_nerfstudio._system.cuda_graphs import RecordedCalls
+from ssa_nerfstudio.plugin.splat_rendering import PARAMETERS, SplatRenderer, activated, render_recorded
+from ssa_nerfstudio.rasterization import cuda
+from ssa_nerfstudio.rasterization.interface import Cameras, RenderOptions
 
 WIDTH, HEIGHT = 96, 64
 
@@ -80,6 +87,43 @@ def test_a_recorded_projection_draws_the_same_with_the_same_gradients(monkeypatc
         if view == 3:  # as a refinement does
             given = {name: torch.nn.Parameter(value.detach()[::2].clone()) for name, value in given.items()}
     assert all(each is not None for each in renderer.projections._known.values())
+
+
+def sums(projected: cuda.Projected, channels: Tensor, cameras, options) -> tuple[Tensor, Tensor]:
+    """In place of blending: all of it counts."""
+    means2d, conics, alphas, *_ = projected
+    image = (channels * alphas[..., None]).sum(dim=1)[:, None, None] + means2d.sum() + conics.square().sum()
+    return image.expand(1, HEIGHT, WIDTH, 3), alphas.sum().expand(1, HEIGHT, WIDTH, 1)
+
+
+@pytest.mark.parametrize("sh_degree", [3, None])
+def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degree):
+    """On a CPU: gsplat's plain projection and harmonics, run again in place of a graph."""
+    monkeypatch.setattr(cuda, "blend", sums)
+    monkeypatch.setattr(
+        cuda,
+        "fully_fused_projection",
+        lambda means, _, quats, scales, *views, **options: projection(
+            means, quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], *views, eps2d=0.3
+        ),
+    )
+    monkeypatch.setattr(cuda, "spherical_harmonics", lambda *given, masks: harmonics(*given))
+    options = RenderOptions(0.01, 1e10, 0.0, 0.3, sh_degree, "RGB", absgrad=False, antialiased=False)
+    given = parameters(30, "cpu")
+    calls = RecordedCalls(run_again)
+    for view in range(4):
+        seen = Cameras(*cameras(view, "cpu"), WIDTH, HEIGHT, None)
+        found = []
+        for plain in (True, False):
+            for value in given.values():
+                value.grad = None
+            image, alpha, info = render_recorded(RecordedCalls(run_again) if plain else calls, given, seen, options)
+            (image[0, 0, 0] * torch.tensor([1.0, 2.0, 3.0])).sum().add(alpha[0, 0, 0, 0]).backward()
+            gradients = {name: value.grad.clone() for name, value in given.items() if value.grad is not None}
+            found.append({"image": image.detach().clone(), "radii": info["radii"].clone(), **gradients})
+        torch.testing.assert_close(found[0], found[1])
+    assert [each is not None for each in calls._known.values()] == [True]
+    assert len(found[0]) == (8 if sh_degree is not None else 7)
 
 
 def test_what_is_drawn_is_the_activated_scene():
