@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -13,17 +13,15 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable, parameters_replaced
 from ssa_nerfstudio.overlay.compositing import clip_straight_through, composite
-from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.resampling import straight_color
-from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_lpips
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_metrics
 from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
-from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
+from ssa_nerfstudio.plugin.photo_formation import clean_image
+from ssa_nerfstudio.plugin.photo_losses import PhotoLosses
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
 from ssa_nerfstudio.plugin.training import nonfinite
@@ -42,15 +40,13 @@ class SSASplatfactoModelConfig(ModelSettings):
     _target: type = field(default_factory=lambda: SSASplatfactoModel)
 
 
-class SSASplatfactoModel(SplatfactoModel):
+class SSASplatfactoModel(PhotoLosses):
     """Gaussian splats and one overlay per camera group. `rgb` is the clean render everywhere.
 
     The overlays come from the pipeline (`artifacts.assign`) or from a checkpoint.
     """
 
     config: SSASplatfactoModelConfig
-    recordable: ClassVar[bool] = True
-    """Whether nothing but `_photo_losses` reads the pictures of a training step, so that they need not be there."""
     strategy: AdaptiveDensityControl | MarkovChainMonteCarlo
     near_plane: Tensor
     """Depth (world units) below which cameras draw nothing."""
@@ -71,7 +67,6 @@ class SSASplatfactoModel(SplatfactoModel):
         self.artifacts = Artifacts()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
         self._draw = SplatRenderer(self.config.rasterizer)
-        self._recorded = RecordedCalls(CapturedPrograms)
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
@@ -226,21 +221,6 @@ class SSASplatfactoModel(SplatfactoModel):
             "background": background if self.training else background.expand(height, width, 3),
         }
 
-    def _with_photo(self, drawn: dict[str, Any], view: int | None) -> dict[str, Any]:
-        """What is drawn for a training view, and `composite` where the photo is predicted as another image."""
-        reduction, ignored = self._get_downscale_factor(), self.config.ignore_background
-        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored)
-        return drawn if photo is None else {**drawn, "composite": photo}
-
-    def _losses_are_recorded(self, with_depth: bool) -> bool:
-        """Whether this step computes from the render to the loss in one launch."""
-        return self._can_be_recorded(with_depth) and self.device.type == "cuda" and graphs_are_usable()
-
-    def _can_be_recorded(self, with_depth: bool) -> bool:
-        """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
-        settings = with_depth or self.config.use_bilateral_grid or self.exposure is not None
-        return self.training and self.recordable and not settings
-
     def _view_matrix(self, camera: Cameras) -> Tensor:
         """World to camera [1, 4, 4], with the camera optimizer's correction while training."""
         if not self.training:
@@ -249,10 +229,6 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.camera_optimizer.config.mode == "off" and prepared is not None:
             return prepared
         return view_matrix(self.camera_optimizer.apply_to_camera(camera))
-
-    def get_gt_img(self, image: Tensor) -> Tensor:
-        """Convert a photo to [0, 1] with upstream's result to the last bit, in one pass over uint8 instead of two."""
-        return super().get_gt_img(torch.div(image, 255.0) if image.dtype == torch.uint8 else image)
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's loss: photometric on the composite, sparsity of the matte, and the strategy's own terms."""
@@ -264,50 +240,6 @@ class SSASplatfactoModel(SplatfactoModel):
         if self.config.use_bilateral_grid:
             losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)
         return losses
-
-    def _photo_losses(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
-        """The terms that depend on the photo or the overlays alone."""
-        target = self.target(outputs, batch)
-        shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
-        mask = self.loss_mask(shown, target, batch)
-        if mask is not None:
-            target, shown = target * mask, shown * mask
-        losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
-        if self._sparsity_counts():
-            learned, kind = self.artifacts.learned(), self.config.sparsity
-            terms = [sparsity_loss(overlay.opacity(), overlay.evidence, kind) for overlay in learned]
-            losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
-        return losses
-
-    def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
-        """`_photo_losses` of a view of which only the splats were drawn, as one CUDA graph; draws the rest, too."""
-        photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
-        splats = [drawn[name] for name in ("color", "accumulation", "background")]
-
-        def compute(color: Tensor, accumulation: Tensor, background: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
-            rgb = clean_image(color, accumulation, background, 1.0)
-            shown = {"rgb": rgb, "accumulation": accumulation, "background": background}
-            with parameters_replaced(self.artifacts, others[len(photo) :]):
-                shown = self._with_photo(shown, drawn["view"])
-                losses = self._photo_losses(shown, dict(zip(photo, others)))  # noqa: B905
-            pictures = (shown[name].detach() for name in ("rgb", "composite") if name in shown)
-            return *losses.values(), *pictures
-
-        view = drawn["view"] if len(self.artifacts) else None
-        kind = None if view is None else self.artifacts.group_of_view(view), tuple(photo)
-        parameters, reduction = list(self.artifacts.parameters()), self._get_downscale_factor()
-        values = self._recorded(compute, [*splats, *photo.values()], parameters, kind, reduction)
-        names = ["main_loss", *["sparsity"] * self._sparsity_counts(), "rgb", "composite"]
-        found = dict(zip(names, values))  # noqa: B905 - there may be no composite
-        drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
-        return found
-
-    def _sparsity_counts(self) -> bool:
-        return self.training and self.config.sparsity != "off" and bool(self.artifacts.learned())
-
-    def loss_mask(self, shown: Tensor, target: Tensor, batch: dict) -> Tensor | None:
-        """Weight [H, W, 1] of every pixel in the photometric loss: the dataset's mask, None where there is none."""
-        return self._downscale_if_required(batch["mask"].float()).to(self.device) if "mask" in batch else None
 
     def get_metrics_dict(self, outputs: dict, batch: dict) -> dict[str, Any]:
         """PSNR of the clean render and of the composite against the photo, and the number of Gaussians.
@@ -330,7 +262,3 @@ class SSASplatfactoModel(SplatfactoModel):
         """
         target = self.target(outputs, batch)
         return view_metrics(outputs, target), view_images(outputs, target)
-
-    def target(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
-        """The photo [H, W, 3] in [0, 1], composited over the render's background where it is transparent."""
-        return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])

@@ -7,7 +7,7 @@ import torch
 from recordings import CUDA, recorder
 
 from ssa_nerfstudio._system.cuda_graphs import RecordedCalls
-from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+from ssa_nerfstudio.plugin.photo_losses import PhotoLosses
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 SETTINGS = pytest.mark.parametrize(
@@ -47,8 +47,8 @@ def set_up(tiny_scene, tmp_path_factory, configure_training):
 
 def record_losses(patch: pytest.MonkeyPatch, recorded: bool) -> None:
     """Record losses wherever they can be, or nowhere."""
-    possible = SSASplatfactoModel._can_be_recorded
-    patch.setattr(SSASplatfactoModel, "_losses_are_recorded", lambda self, depth: recorded and possible(self, depth))
+    possible = PhotoLosses._can_be_recorded
+    patch.setattr(PhotoLosses, "_losses_are_recorded", lambda self, depth: recorded and possible(self, depth))
 
 
 @SETTINGS
@@ -76,7 +76,7 @@ def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, se
     trainer = set_up(device, settings)
     model, manager = trainer.pipeline.model, trainer.pipeline.datamanager
     trainer.pipeline.train()
-    possible = SSASplatfactoModel._losses_are_recorded
+    possible = PhotoLosses._losses_are_recorded
     for step in (1, 2, 3, 4, 11, 12, 13):  # at half the size, then at the whole
         model.step_cb(trainer.optimizers, step)
         camera, batch = manager.next_train(step)
@@ -90,7 +90,7 @@ def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, se
             sum(2.0 * each for each in losses.values()).backward()  # as a gradient scaler's factor
             found.append({f"loss {name}": value.detach().clone() for name, value in losses.items()})
             found[-1] |= {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
-            monkeypatch.setattr(SSASplatfactoModel, "_losses_are_recorded", possible)
+            monkeypatch.setattr(PhotoLosses, "_losses_are_recorded", possible)
         assert found[0].keys() == found[1].keys()
         for name, expected in found[0].items():
             difference = (found[1][name] - expected).norm() / expected.norm().clamp_min(1e-20)

@@ -1,0 +1,99 @@
+"""The losses of a training view that depend on its photo or on the overlays; on CUDA as one graph."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from nerfstudio.models.splatfacto import SplatfactoModel
+from torch import Tensor
+
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable, parameters_replaced
+from ssa_nerfstudio.overlay.photometric import photometric_loss
+from ssa_nerfstudio.overlay.sparsity import sparsity_loss
+from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.exposure import Exposure
+from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
+from ssa_nerfstudio.plugin.settings import ModelSettings
+
+
+class PhotoLosses(SplatfactoModel):
+    """splatfacto with the prediction of a photo, and its comparison with the photo."""
+
+    config: ModelSettings
+    artifacts: Artifacts
+    exposure: Exposure | None
+    recordable: ClassVar[bool] = True
+    """Whether nothing but `_photo_losses` reads the pictures of a training step, so that they need not be there."""
+
+    def populate_modules(self) -> None:
+        """Build splatfacto's modules, and nothing that is recorded yet."""
+        super().populate_modules()
+        self._recorded = RecordedCalls(CapturedPrograms)
+
+    def get_gt_img(self, image: Tensor) -> Tensor:
+        """Convert a photo to [0, 1] with upstream's result to the last bit, in one pass over uint8 instead of two."""
+        return super().get_gt_img(torch.div(image, 255.0) if image.dtype == torch.uint8 else image)
+
+    def target(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
+        """The photo [H, W, 3] in [0, 1], composited over the render's background where it is transparent."""
+        return self.composite_with_background(self.get_gt_img(batch["image"]), outputs["background"])
+
+    def _photo_losses(self, outputs: dict, batch: dict) -> dict[str, Tensor]:
+        """The terms that depend on the photo or the overlays alone."""
+        target = self.target(outputs, batch)
+        shown = outputs.get("composite", outputs["rgb"]) if self.training else outputs["rgb"]
+        mask = self.loss_mask(shown, target, batch)
+        if mask is not None:
+            target, shown = target * mask, shown * mask
+        losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
+        if self._sparsity_counts():
+            learned, kind = self.artifacts.learned(), self.config.sparsity
+            terms = [sparsity_loss(overlay.opacity(), overlay.evidence, kind) for overlay in learned]
+            losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
+        return losses
+
+    def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
+        """`_photo_losses` of a view of which only the splats were drawn, as one CUDA graph; draws the rest, too."""
+        photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
+        splats = [drawn[name] for name in ("color", "accumulation", "background")]
+
+        def compute(color: Tensor, accumulation: Tensor, background: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+            rgb = clean_image(color, accumulation, background, 1.0)
+            shown = {"rgb": rgb, "accumulation": accumulation, "background": background}
+            with parameters_replaced(self.artifacts, others[len(photo) :]):
+                shown = self._with_photo(shown, drawn["view"])
+                losses = self._photo_losses(shown, dict(zip(photo, others)))  # noqa: B905
+            pictures = (shown[name].detach() for name in ("rgb", "composite") if name in shown)
+            return *losses.values(), *pictures
+
+        view = drawn["view"] if len(self.artifacts) else None
+        kind = None if view is None else self.artifacts.group_of_view(view), tuple(photo)
+        parameters, reduction = list(self.artifacts.parameters()), self._get_downscale_factor()
+        values = self._recorded(compute, [*splats, *photo.values()], parameters, kind, reduction)
+        names = ["main_loss", *["sparsity"] * self._sparsity_counts(), "rgb", "composite"]
+        found = dict(zip(names, values))  # noqa: B905 - there may be no composite
+        drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
+        return found
+
+    def _sparsity_counts(self) -> bool:
+        return self.training and self.config.sparsity != "off" and bool(self.artifacts.learned())
+
+    def loss_mask(self, shown: Tensor, target: Tensor, batch: dict) -> Tensor | None:
+        """Weight [H, W, 1] of every pixel in the photometric loss: the dataset's mask, None where there is none."""
+        return self._downscale_if_required(batch["mask"].float()).to(self.device) if "mask" in batch else None
+
+    def _with_photo(self, drawn: dict[str, Any], view: int | None) -> dict[str, Any]:
+        """What is drawn for a training view, and `composite` where the photo is predicted as another image."""
+        reduction, ignored = self._get_downscale_factor(), self.config.ignore_background
+        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored)
+        return drawn if photo is None else {**drawn, "composite": photo}
+
+    def _losses_are_recorded(self, with_depth: bool) -> bool:
+        """Whether this step computes from the render to the loss in one launch."""
+        return self._can_be_recorded(with_depth) and self.device.type == "cuda" and graphs_are_usable()
+
+    def _can_be_recorded(self, with_depth: bool) -> bool:
+        """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
+        settings = with_depth or self.config.use_bilateral_grid or self.exposure is not None
+        return self.training and self.recordable and not settings
