@@ -49,7 +49,7 @@ class Command:
     """Whether the method learns an overlay; splatfacto has none."""
 
     alternate: bool = False
-    """Take eight turns of 100 steps, with CUDA graphs and without (SSA_CUDA_GRAPHS=0), and print a line for both."""
+    """Take eight turns of 100 steps, without CUDA graphs and with (SSA_CUDA_GRAPHS=1), and print a line for both."""
     profile: Path | None = None
     """Write a table of torch's profiler to this file, and end after the steps that are in it."""
 

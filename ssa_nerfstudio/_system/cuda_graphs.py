@@ -1,7 +1,7 @@
 """Functions of fixed shapes as CUDA graphs: one launch for their values, one for their gradients.
 
-A training step of splats waits for its host, which launches some two hundred kernels one by one. With
-SSA_CUDA_GRAPHS=0 it does so everywhere; the kernels are the same.
+A training step of splats waits for its host, which launches some two hundred kernels one by one. It does so unless
+SSA_CUDA_GRAPHS=1; the kernels are the same.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _LOG = logging.getLogger(__name__)
 
 
 def graphs_are_usable() -> bool:
-    """Whether there is CUDA, and SSA_CUDA_GRAPHS is not 0."""
-    return os.environ.get("SSA_CUDA_GRAPHS", "1") != "0" and _has_cuda()
+    """Whether SSA_CUDA_GRAPHS is 1, and there is CUDA."""
+    return os.environ.get("SSA_CUDA_GRAPHS") == "1" and _has_cuda()
 
 
 @cache
