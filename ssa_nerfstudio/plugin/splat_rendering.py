@@ -91,6 +91,7 @@ def render_recorded(
     kind = cameras.width, cameras.height, *vars(options).values()
     views, learned = [cameras.viewmats, cameras.Ks], [parameters[name] for name in PARAMETERS]
     colors, *rest = calls(compute, views, learned, kind)
-    projected = cuda.Projected(*rest) if options.sh_degree is not None else cuda.Projected(*rest, None)
+    means2d, conics, alphas, depths, radii, *directions = rest
+    projected = cuda.Projected(means2d, conics, alphas, depths, radii, directions[0] if directions else None)
     image, alpha = cuda.blend(projected, cuda.shade(projected, colors, options), cameras, options)
     return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)

@@ -46,7 +46,7 @@ def test_a_recorded_function_has_the_values_and_gradients_of_the_plain_one(devic
     recorded = RecordedFunction(mixture, mixture.inputs(), [mixture.weights, mixture.unused], recorder(device)())
     for step in range(3):
         with torch.no_grad():
-            mixture.weights += 0.1  # as an optimizer does, in place
+            mixture.weights.add_(0.1)  # as an optimizer does, in place
         inputs = mixture.inputs()
         for slope in (1.0, 2.0 + step):
             torch.testing.assert_close(
@@ -64,6 +64,7 @@ def test_a_value_that_nothing_depends_on_has_no_slope(device):
         outcome(function, mixture, inputs, 1.0)
         mixture.weights.grad = None
         function(*inputs)[0].backward()
+        assert mixture.weights.grad is not None
         found, mixture.weights.grad = mixture.weights.grad.clone(), None
         mixture(*inputs)[0].backward()
         torch.testing.assert_close(found, mixture.weights.grad)
@@ -123,6 +124,7 @@ def test_gradients_accumulate_as_without_recordings():
     for _ in range(3):  # the third is a recording
         mixture.weights.grad = None
         calls(mixture, inputs, [mixture.weights], "kind")[0].backward()
+    assert mixture.weights.grad is not None
     once = mixture.weights.grad.clone()
     calls(mixture, inputs, [mixture.weights], "kind")[0].backward()
     torch.testing.assert_close(mixture.weights.grad, 2 * once)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import pytest
 import torch
 from gsplat.cuda._torch_impl import _fully_fused_projection as projection
@@ -40,7 +42,7 @@ def cameras(view: int, device: str) -> tuple[Tensor, Tensor]:
     return pose[None].to(device), K[None].to(device)
 
 
-def outcome(renderer: SplatRenderer, given: dict[str, Tensor], view: int, sh_degree: int | None, mode: str):
+def outcome(renderer: SplatRenderer, given: Mapping[str, Tensor], view: int, sh_degree: int | None, mode: str):
     device = str(given["means"].device)
     for value in given.values():
         value.grad = None
@@ -100,13 +102,13 @@ def sums(projected: cuda.Projected, channels: Tensor, cameras, options) -> tuple
 def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degree):
     """On a CPU: gsplat's plain projection and harmonics, run again in place of a graph."""
     monkeypatch.setattr(cuda, "blend", sums)
-    monkeypatch.setattr(
-        cuda,
-        "fully_fused_projection",
-        lambda means, _, quats, scales, *views, **options: projection(
-            means, quat_scale_to_covar_preci(quats, scales, compute_preci=False)[0], *views, eps2d=0.3
-        ),
-    )
+
+    def project(means: Tensor, _, quats: Tensor, scales: Tensor, *views, **options) -> tuple[Tensor | None, ...]:
+        covariances, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
+        assert covariances is not None
+        return projection(means, covariances, *views, eps2d=0.3)
+
+    monkeypatch.setattr(cuda, "fully_fused_projection", project)
     monkeypatch.setattr(cuda, "spherical_harmonics", lambda *given, masks: harmonics(*given))
     options = RenderOptions(0.01, 1e10, 0.0, 0.3, sh_degree, "RGB", absgrad=False, antialiased=False)
     given = parameters(30, "cpu")

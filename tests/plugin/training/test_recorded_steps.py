@@ -53,6 +53,7 @@ def test_recorded_steps_move_parameters_as_plain_ones_do(monkeypatch, caplog, de
             optimizers.step_groups(list(optimizers.parameters), torch.tensor(0.5, device=device), NO_SCALER)
             optimizers.scheduler_step_all(step)
         if guarded:
+            assert optimizers.guard is not None
             assert optimizers.guard.check(19) == 1
         states = [each for o in optimizers.optimizers.values() for v in o.state.values() for each in v.values()]
         results.append([*(p.detach() for group in optimizers.parameters.values() for p in group), *states])

@@ -91,7 +91,7 @@ def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, se
                 record_losses(monkeypatch, recorded)
             torch.manual_seed(step)  # of the background
             losses = model.get_loss_dict(model(camera), batch)
-            sum(2.0 * each for each in losses.values()).backward()  # as a gradient scaler's factor
+            (2.0 * torch.stack(list(losses.values())).sum()).backward()  # as a gradient scaler's factor
             found.append({f"loss {name}": value.detach().clone() for name, value in losses.items()})
             found[-1] |= {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
             monkeypatch.setattr(PhotoLosses, "_losses_are_recorded", possible)
