@@ -1,6 +1,7 @@
 """A row for each capture and artifact: off, paper's rule, default and oracle: `python benchmarks/rows.py RESULTS`
 
-From results of `ssa bench captures`; PSNR in dB, means over seeds.
+From results of `ssa bench captures`; PSNR in dB, means over seeds. With --methods, a column for each of them and the
+rows that all of them have: `python benchmarks/rows.py RESULTS --methods 3dgs desplat default default/mcmc`.
 """
 
 from __future__ import annotations
@@ -43,12 +44,32 @@ def marked(difference: float | None) -> str:
     return f"{difference:+.2f}" if difference >= -MAX_LOSS else f"**{difference:+.2f}**"
 
 
+def side_by_side(study: Study, methods: tuple[str, ...]) -> str:
+    """A table of PSNR, a column for each method (`default`, or `default/mcmc`), and the mean of each over full rows."""
+    columns = [(name, densification or "adc") for name, _, densification in (m.partition("/") for m in methods)]
+    lines = [f"| | | {' | '.join(methods)} |", f"|{'---|' * (2 + len(methods))}"]
+    full: list[list[float]] = []
+    for effect, scene in sorted(study.pairs, key=lambda pair: pair[1]):
+        row = [mean(study.select(effect, scene, *column), "psnr") for column in columns]
+        if any(value is not None for value in row[1:]):
+            lines.append(f"| `{scene}` | {effect} | {' | '.join('' if v is None else f'{v:.2f}' for v in row)} |")
+        if None not in row:
+            full.append([value for value in row if value is not None])
+    if full:
+        means = (statistics.mean(column) for column in zip(*full, strict=True))
+        lines.append(f"| mean of {len(full)} | | {' | '.join(f'{value:.2f}' for value in means)} |")
+    return "\n".join(lines)
+
+
 @dataclass
 class Command:
     """Print a table for each length: a row for each capture and artifact."""
 
     folders: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FOLDERS")] = ()
     """Output folders of `ssa bench`; several are added up."""
+
+    methods: tuple[str, ...] = ()
+    """Columns: methods under ADC, or METHOD/mcmc. Empty: off, paper's rule, default and oracle under both."""
 
     def run(self) -> None:
         """Print.
@@ -61,6 +82,9 @@ class Command:
         if not compared:
             raise InputError("no results with clean test photos", "name the --output of ssa bench captures")
         for study in compared:
+            if self.methods:
+                print(f"\n{study.title}\n\n{side_by_side(study, self.methods)}")
+                continue
             columns = ("off", "paper's rule", "default (worst view)", "oracle", "difference")
             heads = [f"{d.upper()}: {column}" for d in study.densifications for column in columns]
             print(f"\n{study.title}\n\n| | | {' | '.join(heads)} |\n|{'---|' * (2 + len(heads))}")

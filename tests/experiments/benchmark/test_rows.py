@@ -26,6 +26,19 @@ def test_a_row_compares_the_default_with_the_better_reference(tmp_path, capsys):
     assert "at most 0.3 dB behind" in printed
 
 
+def test_methods_side_by_side(tmp_path, capsys):
+    results = [r for r in all_results() if (r.run.scene, r.run.effect, r.run.method) != ("barn", "mud", "paper")]
+    Command((folder_of(tmp_path, results),), ("paper", "default", "default/mcmc")).run()
+    table = [[cell.strip() for cell in line.split("|")] for line in capsys.readouterr().out.splitlines() if "|" in line]
+    rows = {(scene, effect): values for _, scene, effect, *values, _ in table[2:]}
+    assert rows["`barn`", "mud"][0] == ""
+    (label,) = (scene for scene, _ in rows if scene.startswith("mean of"))
+    whole = [values for (scene, _), values in rows.items() if "" not in values and scene != label]
+    assert label == f"mean of {len(whole)}"
+    for k, value in enumerate(rows[label, ""]):
+        assert float(value) == pytest.approx(sum(float(values[k]) for values in whole) / len(whole), abs=0.006)
+
+
 def test_a_folder_without_results_is_refused(tmp_path):
     (tmp_path / "results").mkdir()
     with pytest.raises(InputError, match="no results"):
