@@ -178,7 +178,7 @@ class SSASplatfactoModel(PhotoLosses):
         if self.crop_box is not None and not self.training:
             inside = self.crop_box.within(self.means).squeeze()
             if not inside.any():
-                return self.get_empty_outputs(width, height, self.background_color)
+                return self.get_empty_outputs(width, height, self.background_color.to(self.device))
             gaussians = {name: values[inside] for name, values in gaussians.items()}
         sh_degree = None
         if self.config.sh_degree > 0:

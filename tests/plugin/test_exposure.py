@@ -201,7 +201,7 @@ def trained(train):
 
 def test_a_training_finds_the_exposures_and_that_the_dashboard_has_them(trained, varying_scene):
     model = trained.pipeline.model
-    found = model.exposure.transforms.detach()
+    found = model.exposure.transforms.detach().cpu()
     assert model.exposure.place == "photo"
     assert model.exposure.photos == [f"images/train_{number:04d}.png" for number in range(12)]
     wrong = found[:, 0].mean(dim=1).numpy() - varying_scene[1]
@@ -226,7 +226,8 @@ def test_test_views_are_at_the_mean_exposure(trained):
 
 def test_the_same_training_gives_the_same_exposures(train, trained):
     again = train()
-    assert torch.equal(again.pipeline.model.exposure.transforms, trained.pipeline.model.exposure.transforms)
+    found, expected = (trainer.pipeline.model.exposure.transforms for trainer in (again, trained))
+    torch.testing.assert_close(found, expected, atol=1e-3 if found.is_cuda else 0, rtol=0)  # gsplat adds in any order
 
 
 def test_off_leaves_no_trace(train):
@@ -268,5 +269,7 @@ def test_a_skipped_step_leaves_the_exposures_alone(train):
         for group in optimizer.param_groups:
             for parameter in group["params"]:
                 parameter.grad = torch.full_like(parameter, torch.nan)
-    trainer.optimizers.step_groups(list(trainer.optimizers.parameters), torch.tensor(1.0), trainer.grad_scaler)
+    trainer.optimizers.step_groups(
+        list(trainer.optimizers.parameters), torch.ones((), device=trainer.device), trainer.grad_scaler
+    )
     assert torch.equal(trainer.pipeline.model.exposure.transforms, before)

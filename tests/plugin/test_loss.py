@@ -43,14 +43,20 @@ SHOWN, PHOTO = (torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(se
 
 def losses(model, **batch) -> dict[str, torch.Tensor]:
     outputs = {"rgb": torch.zeros(48, 64, 3), "composite": SHOWN, "background": torch.zeros(3)}
+    outputs = {name: value.to(model.device) for name, value in outputs.items()}
     return model.get_loss_dict(outputs, {"image": PHOTO, **batch})
+
+
+def assert_close(found: torch.Tensor, expected: torch.Tensor) -> None:
+    """Equal to float32's rounding, on whichever devices they are."""
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7, check_device=False)
 
 
 def test_what_a_mask_excludes_is_no_part_of_the_loss(model):
     mask = torch.ones(48, 64, 1)
     mask[:, :20] = 0
     masked = losses(model, mask=mask.bool())["main_loss"]
-    torch.testing.assert_close(masked, photometric_loss(SHOWN * mask, PHOTO * mask, model.config.ssim_lambda))
+    assert_close(masked, photometric_loss(SHOWN * mask, PHOTO * mask, model.config.ssim_lambda))
     elsewhere = PHOTO.clone()
     elsewhere[:, :20] = 0.123
     assert losses(model, image=elsewhere, mask=mask.bool())["main_loss"] == masked
@@ -60,26 +66,26 @@ def test_what_a_mask_excludes_is_no_part_of_the_loss(model):
 def test_the_loss_of_a_test_photo_is_of_the_clean_render(model):
     model.eval()
     rendered = photometric_loss(torch.zeros(48, 64, 3), PHOTO, model.config.ssim_lambda)
-    torch.testing.assert_close(losses(model)["main_loss"], rendered)
+    assert_close(losses(model)["main_loss"], rendered)
 
 
 def test_several_overlays_weigh_as_much_as_one(model):
     one = losses(model)["sparsity"]
     weight = model.config.sparsity_weight
     own = model.artifacts.learned()[0]
-    torch.testing.assert_close(one, weight * sparsity_loss(own.opacity(), own.evidence, "log"))
-    other = ScreenSpaceOverlay(48, 64)
+    assert_close(one, weight * sparsity_loss(own.opacity(), own.evidence, "log"))
+    other = ScreenSpaceOverlay(48, 64).to(model.device)
     with torch.no_grad():
         other.alpha_logits.add_(3)
     model.artifacts.overlays = torch.nn.ModuleList([own, other])
     second = weight * sparsity_loss(other.opacity(), other.evidence, "log")
-    torch.testing.assert_close(losses(model)["sparsity"], (one + second) / 2)
+    assert_close(losses(model)["sparsity"], (one + second) / 2)
 
 
 def test_mcmc_pays_for_opacity_and_for_size(model):
     terms = losses(model)
-    torch.testing.assert_close(terms["opacity_reg"], 0.01 * torch.sigmoid(model.opacities).mean())
-    torch.testing.assert_close(terms["mcmc_scale_reg"], 0.01 * torch.exp(model.scales).mean())
+    assert_close(terms["opacity_reg"], 0.01 * torch.sigmoid(model.opacities).mean())
+    assert_close(terms["mcmc_scale_reg"], 0.01 * torch.exp(model.scales).mean())
     model.config.strategy = "adc"
     assert not {"opacity_reg", "mcmc_scale_reg"} & losses(model).keys()
 
@@ -97,7 +103,7 @@ def test_long_gaussians_are_penalized_every_tenth_step(model):
     ratio = sizes.amax(dim=-1) / sizes.amin(dim=-1)
     penalty = losses(model)["scale_reg"]
     assert penalty > 0.05
-    torch.testing.assert_close(penalty, 0.1 * (ratio.clamp_min(1.5) - 1.5).mean())
+    assert_close(penalty, 0.1 * (ratio.clamp_min(1.5) - 1.5).mean())
     with torch.no_grad():
         model.scales.copy_(before)
 
@@ -117,7 +123,7 @@ def test_harmonics_come_one_degree_at_a_time(model, trainer):
     with torch.no_grad():
         model.features_rest[:, :3] -= 0.5
     assert not torch.equal(constant, first)
-    torch.testing.assert_close(first, everything)
+    assert_close(first, everything)
 
 
 def test_every_view_is_drawn_once_before_any_comes_again(trainer):

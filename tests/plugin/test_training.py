@@ -67,7 +67,7 @@ def test_an_overlay_recovers_the_scene_behind_a_dashboard(trained):
 def test_the_matte_learned_is_the_dashboard(trained, draw_effect):
     _, pipeline, _ = trained["on"]
     truth = draw_effect("dashboard", 48, 64).matte
-    matte = pipeline.model.artifacts.learned()[0].matte().detach().numpy()[..., 0]
+    matte = pipeline.model.artifacts.learned()[0].matte().numpy(force=True)[..., 0]
     assert matte[truth > 0.99].mean() > 0.9
     assert matte[truth < 0.01].mean() < 0.15
 
@@ -103,8 +103,8 @@ def test_a_given_overlay_is_buffers_and_does_not_learn(trained, draw_effect):
     layers = draw_effect("dashboard", 48, 64)
     assert "overlay" not in pipeline.get_param_groups()
     transmittance, addition = pipeline.model.artifacts[0].layers()
-    np.testing.assert_array_equal(transmittance.numpy(), layers.transmittance)
-    np.testing.assert_array_equal(addition.numpy(), layers.addition)
+    np.testing.assert_array_equal(transmittance.numpy(force=True), layers.transmittance)
+    np.testing.assert_array_equal(addition.numpy(force=True), layers.addition)
 
 
 def same(state: dict, other: dict) -> bool:
@@ -132,6 +132,7 @@ def test_metrics_are_of_the_clean_render_and_complete(trained):
     assert "lpips" not in outcome.metrics
 
 
+@pytest.mark.skipif(torch.cuda.is_available(), reason="gsplat adds gradients up in any order")
 def test_training_twice_gives_the_same_scene(tiny_scene, tmp_path, run):
     (_, a, _), (_, b, _) = (run(tiny_scene, tmp_path / name, 12) for name in "ab")
     assert same(a.model.state_dict(), b.model.state_dict())
