@@ -128,6 +128,40 @@ def compose(pictures: Sequence[tuple[Face, np.ndarray]], width: int) -> tuple[np
     return total / np.maximum(weights, np.float32(1e-6)), weights[..., 0] > 0
 
 
+def owned_by_neighbors(face: Face, others: Sequence[Face], scale: int = 1) -> list[tuple[Face, np.ndarray, np.ndarray]]:
+    """Which pixels of a face look where another one looks closer to its middle, and where those are in the other.
+
+    Each direction has one owner: the face whose axis is nearest, of those that see it.
+
+    Args:
+        face: which.
+        others: the other faces, of the same size.
+        scale: pixels of a face along the side of one that is meant, as an overlay of lower resolution has them.
+
+    Returns:
+        For each owner: numbers of the face's pixels [P], row by row, and positions [P, 2] in the owner's pixels, (0, 0)
+        the outer corner of the first.
+    """
+    side = -(-face.size // scale)
+    axis = ((np.arange(side) + 0.5) * scale - face.size / 2) / face.focal
+    x, y = np.meshgrid(axis, axis)
+    directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ face.from_panorama
+    nearest = directions @ face.from_panorama[2]
+    owner, found = np.full(len(directions), -1), np.zeros((len(directions), 2))
+    for number, other in enumerate(others):
+        positions, depth = other.pixels(directions)
+        inside = (
+            (depth > 0) & (positions >= scale / 2).all(axis=-1) & (positions <= other.size - scale / 2).all(axis=-1)
+        )
+        closer = inside & (depth > nearest)
+        owner[closer], found[closer], nearest[closer] = number, positions[closer] / scale, depth[closer]
+    return [
+        (other, np.flatnonzero(owner == number), found[owner == number])
+        for number, other in enumerate(others)
+        if (owner == number).any()
+    ]
+
+
 def hidden_by_neighbors(face: Face, neighbors: Sequence[tuple[Face, np.ndarray]]) -> np.ndarray:
     """Layers of other faces where these overlap with a face, in the face's frame; of several the least transmittance.
 

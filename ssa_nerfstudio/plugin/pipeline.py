@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
 from torch.cuda.amp.grad_scaler import GradScaler
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.groups import same_intrinsics
 from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
+from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
@@ -30,6 +32,7 @@ from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
+from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
@@ -77,6 +80,7 @@ class SSAPipeline(VanillaPipeline):
             if test_mode == "val" and parser.load_3D_points:
                 check_seed_points(transforms)
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
+        self.sphere: SharedSphere | None = None
         check_views(self.datamanager.train_dataparser_outputs, source)
         self.first_view = FirstView(lambda: self.datamanager.train_dataset.cameras)
         if test_mode == "val":
@@ -99,6 +103,7 @@ class SSAPipeline(VanillaPipeline):
             check_masks(photos, group_cameras(dataset.cameras)[1], self.datamanager.photo_names(dataset))
         samples = self._start_exposure()
         self._set_overlays(photos, lenses)
+        self.sphere = self._shared_sphere()
         if self.model.exposure is not None and samples is not None and len(self.model.artifacts):
             by_photos = self.config.model.exposure_place == "auto"
             start_beside_artifact(self.model.exposure, self.model.artifacts, samples, by_photos)
@@ -175,12 +180,9 @@ class SSAPipeline(VanillaPipeline):
         else:
             views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
             gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
-            transforms = self._transforms()
-            panorama = None if transforms is None else read_panorama(transforms)
-            faces = None if panorama is None else faces_of(panorama, keys)
             learned = learned_overlays(
                 self.config.model, photos, names, views, self._points(), groups, sizes, gains,
-                lambda group: self._withheld_photos(keys[group]), faces,
+                lambda group: self._withheld_photos(keys[group]), self._faces(keys),
             )  # fmt: skip
             overlays = [each.overlay for each in learned]
             starts, cameras = [each.start for each in learned], [each.camera for each in learned]
@@ -189,6 +191,30 @@ class SSAPipeline(VanillaPipeline):
             groups = [group_of[view] for view in range(len(photos))]
         first = [groups.index(g) for g in range(len(keys))]
         artifacts.assign(overlays, keys, groups, lenses[first], starts, cameras)
+
+    def _faces(self, keys: torch.Tensor) -> list[Face] | None:
+        """The faces of a panorama that cameras [G, 6] are; None where they are none."""
+        transforms = self._transforms()
+        panorama = None if transforms is None else read_panorama(transforms)
+        return None if panorama is None else faces_of(panorama, keys)
+
+    def _shared_sphere(self) -> SharedSphere | None:
+        """What the learned overlays share; None where no two of them are of faces of one panorama."""
+        overlays = self.model.artifacts.learned()
+        faces = self._faces(self.model.artifacts.camera_keys.cpu()) if len(overlays) > 1 else None
+        return None if faces is None else SharedSphere(faces, overlays)
+
+    def get_training_callbacks(self, training_callback_attributes: Any) -> list[TrainingCallback]:
+        """Upstream's; and where overlays share a sphere, they do so every few steps."""
+        callbacks, sphere = super().get_training_callbacks(training_callback_attributes), self.sphere
+        if sphere is not None:
+
+            def share(step: int) -> None:
+                if (step + 1) % EVERY == 0:
+                    sphere.share()
+
+            callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], share))
+        return callbacks
 
     def _withheld_photos(self, key: torch.Tensor) -> list[NamedPhoto]:
         """Test photos of the camera with this key of `group_cameras` that have its artifact: stated ones are clean."""
