@@ -144,9 +144,10 @@ def owned_by_neighbors(face: Face, others: Sequence[Face], scale: int = 1) -> li
     """
     side = -(-face.size // scale)
     axis = ((np.arange(side) + 0.5) * scale - face.size / 2) / face.focal
-    x, y = np.meshgrid(axis, axis)
-    directions = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) @ face.from_panorama
-    nearest = directions @ face.from_panorama[2]
+    x, y = (each.ravel() for each in np.meshgrid(axis, axis))
+    beyond = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) > 1)  # 45 degrees; all others are its own
+    directions = np.stack([x[beyond], y[beyond], np.ones(len(beyond))], axis=-1) @ face.from_panorama
+    nearest = np.ones(len(beyond))
     owner, found = np.full(len(directions), -1), np.zeros((len(directions), 2))
     for number, other in enumerate(others):
         positions, depth = other.pixels(directions)
@@ -156,7 +157,7 @@ def owned_by_neighbors(face: Face, others: Sequence[Face], scale: int = 1) -> li
         closer = inside & (depth > nearest)
         owner[closer], found[closer], nearest[closer] = number, positions[closer] / scale, depth[closer]
     return [
-        (other, np.flatnonzero(owner == number), found[owner == number])
+        (other, beyond[owner == number], found[owner == number])
         for number, other in enumerate(others)
         if (owner == number).any()
     ]

@@ -59,11 +59,9 @@ class SharedSphere:
     @torch.no_grad()
     def share(self) -> None:
         """Let every pixel that another face owns repeat it: the matte, and the color or light that is added."""
-        layers = [torch.cat(_matte_and_addition(overlay), dim=-1).reshape(-1, 4) for overlay in self._overlays]
-        for overlay, copies in zip(self._overlays, self._copies, strict=True):
-            for copy in copies:
-                found = (layers[copy.owner][copy.sources] * copy.weights).sum(dim=1)
-                alpha, addition = found.split((1, 3), dim=-1)
+        found = [[self._repeated(copy) for copy in copies] for copies in self._copies]
+        for overlay, copies, values_of in zip(self._overlays, self._copies, found, strict=True):
+            for copy, (alpha, addition) in zip(copies, values_of, strict=True):
                 color = addition if overlay.adds_light else addition / alpha.clamp_min(1e-9)
                 for logits, values, limits in (
                     (overlay.alpha_logits, alpha, MATTE_LOGIT_RANGE),
@@ -72,11 +70,15 @@ class SharedSphere:
                     flat = logits.view(-1, logits.shape[-1])
                     flat[copy.pixels] = values.clamp(0, 1).logit().clamp(*limits)
 
-
-def _matte_and_addition(overlay: ScreenSpaceOverlay) -> tuple[Tensor, Tensor]:
-    """A [h, w, 1] and B [h, w, 3], in front of the lens."""
-    matte, color = overlay.matte(), overlay.color()
-    return matte, color if overlay.adds_light else matte * color
+    def _repeated(self, copy: _Copies) -> tuple[Tensor, Tensor]:
+        """A [P, 1] and B [P, 3], in front of the lens, where an owner is to be repeated."""
+        owner = self._overlays[copy.owner]
+        matte, color = (
+            torch.sigmoid(logits.view(-1, logits.shape[-1])[copy.sources])
+            for logits in (owner.alpha_logits, owner.color_logits)
+        )
+        addition = color if owner.adds_light else matte * color
+        return (matte * copy.weights).sum(dim=1), (addition * copy.weights).sum(dim=1)
 
 
 def _around(positions: np.ndarray, side: int, device: torch.device) -> tuple[Tensor, Tensor]:
