@@ -107,6 +107,8 @@ class Command:
             camera = f"{name}: " if len(found) > 1 else ""
             console.print(f"{camera}{verdict_in_words(detection)}")
         console.print(f"{output}: evidence.png, and masks whose black is the artifact")
+        if all(detection.nothing_moves for detection in found.values()):
+            return
         wanted = any(detection.verdict != "none" for detection in found.values())
         console.print(
             f"Train {'with' if wanted else 'without'} an overlay: ssa run {shlex.quote(str(self.data))} --output OUT"

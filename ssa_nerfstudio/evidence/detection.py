@@ -73,6 +73,11 @@ class Detection:
     """Two or more, where the artifact changes (`interval_detection`)."""
 
     @property
+    def nothing_moves(self) -> bool:
+        """Whether all of the frame stands still: there is no scene to tell an artifact from."""
+        return self.verdict != "none" and not self.intervals and bool(self.mask.all())
+
+    @property
     def too_few_edges(self) -> bool:
         """Whether the static edges are significant, but too few to be reported."""
         return self.verdict == "none" and self.p_value <= SIGNIFICANCE

@@ -17,6 +17,8 @@ def verdict_in_words(detection: Detection) -> str:
         return f"no static artifact in {photos}: some edges stand still, but too few to be one"
     if detection.verdict == "none":
         return f"no static artifact in {photos}"
+    if detection.nothing_moves:
+        return f"nothing moves in {photos}: are they of one view? Those of a scene are taken from many"
     if detection.intervals:
         return f"an artifact that changes: {', '.join(map(_interval_in_words, detection.intervals))}"
     return (

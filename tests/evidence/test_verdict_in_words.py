@@ -45,6 +45,10 @@ PARTS = (Interval(0, 10, "none", 0.0), Interval(10, 25, "faint", 0.031))
             "(chance of a false alarm at most 1.8%)",
         ),
         (
+            replace(FOUND, coverage=1.0, mask=torch.ones(4, 6, dtype=torch.bool)),
+            "nothing moves in 25 photos: are they of one view? Those of a scene are taken from many",
+        ),
+        (
             replace(FOUND, intervals=PARTS),
             "an artifact that changes: in photos 1 to 10 none, in photos 11 to 25 3.1% of the frame, semi-transparent",
         ),
