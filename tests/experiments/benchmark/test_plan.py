@@ -67,6 +67,16 @@ def test_clean_counterparts_are_trained_on_where_nothing_is_asked_to_be_in_front
     assert [run.effect for run in only] == ["finger"]
 
 
+def test_effects_are_put_in_front_of_counterparts_where_a_scene_states_no_artifact():
+    game = SceneEntry("yard", name="game", clean="clean")
+    runs = plan(benchmark(scenes=(game,), parts=(Part(("3dgs", "given"), effects=("none", "mud")),)))
+    assert {(run.method, run.effect, run.real, run.counterparts) for run in runs} == {
+        ("3dgs", "none", False, "clean"),
+        ("3dgs", "mud", False, "clean"),
+        ("given", "mud", False, "clean"),
+    }
+
+
 def test_exposure_is_part_of_a_run_and_of_its_dataset():
     plain, varying = (
         plan(Benchmark((SceneEntry("barn", exposure=e),), (Part(("3dgs",), effect_seed=2),)))[0] for e in (0, 0.2)
@@ -192,7 +202,7 @@ def test_marks_rise_to_the_last_step(steps, count):
         ),
         ("scenes: [{data: a, downscale: 0}]", "downscale"),
         ("scenes: [{data: 'a b'}]", "letters, digits"),
-        ("scenes: [{data: a, clean: b}]", "a: clean, mask and clean_tests are for scenes that state their artifact"),
+        ("scenes: [{data: a, mask: b}]", "a: mask and clean_tests are for scenes that state their artifact"),
         ("scenes: [{data: a, artifact: mud, clean_tests: false}]", "a mask of the artifact is needed"),
         ("scenes: [{data: a}]\ncandidates: {paper: {sparsity: log}}", "candidate 'paper'"),
         ("scenes: [{data: a}]\ncandidates: {mine: {method: ours}}", "no method 'ours'"),

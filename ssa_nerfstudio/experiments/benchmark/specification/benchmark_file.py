@@ -34,7 +34,8 @@ class SceneEntry:
     artifact: str | None = None
     """What its training photos carry already (finger, mud, occlusion): then no effect is put in front of them."""
     clean: str | None = None
-    """Folder in it with a clean counterpart of every photo, under the same name: what the effect `none` trains on."""
+    """Folder in it with a clean counterpart of every photo, under the same name: what the effect `none` trains on.
+    Where no artifact is stated, all effects are put in front of these."""
     mask: str | None = None
     """Picture in it, white where the artifact of a raw photo may be. Scores are taken by it; no training sees it."""
     clean_tests: bool = True
@@ -53,8 +54,8 @@ class SceneEntry:
             raise ValueError(f"{self.title}: exposure must be in [0, 1], and 0 where the photos carry an artifact")
         if not re.fullmatch(r"[A-Za-z0-9_.]*[A-Za-z0-9_][A-Za-z0-9_.]*", self.title):  # "." and ".." are folders
             raise ValueError(f"scene name {self.title!r} must consist of letters, digits, _ and dots; state one: name")
-        if self.artifact is None and (self.clean or self.mask or not self.clean_tests):
-            raise ValueError(f"{self.title}: clean, mask and clean_tests are for scenes that state their artifact")
+        if self.artifact is None and (self.mask or not self.clean_tests):
+            raise ValueError(f"{self.title}: mask and clean_tests are for scenes that state their artifact")
         if not self.clean_tests and self.mask is None:
             raise ValueError(f"{self.title}: without clean test photos, a mask of the artifact is needed")
 
