@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.camera_matching import find_frame, group_cameras
 from ssa_nerfstudio.plugin.evaluation import view_metrics
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
@@ -103,10 +104,16 @@ def _pictured(pipeline: SSAPipeline) -> list[PicturedGroup]:
     keys, groups = group_cameras(dataset.cameras)
     paths = pipeline.datamanager.photo_names(dataset)
     members = [[paths[view] for view in range(len(photos)) if groups[view] == group] for group in range(len(keys))]
-    known = torch.cat([artifacts.camera_keys, artifacts.bare_keys]).cpu()
-    places = [find_frame(key, known) for key in keys] if names else [None] * len(keys)
-    overlays = [names[place] if place is not None and place < len(names) else None for place in places]
+    places = _places(keys, artifacts) if names else [len(names)] * len(keys)
+    overlays = [names[place] if place < len(names) else None for place in places]
     return [PicturedGroup(title, overlay) for title, overlay in zip(camera_names(members), overlays, strict=True)]
+
+
+def _places(keys: Tensor, artifacts: Artifacts) -> list[int]:
+    """A group of each camera [G, 6], the number of groups for a camera that the model has not seen."""
+    known = torch.cat([artifacts.camera_keys, artifacts.bare_keys]).cpu()
+    places = [find_frame(key, known) for key in keys]
+    return [len(known) if place is None else place for place in places]
 
 
 @torch.no_grad()
@@ -120,11 +127,15 @@ def write_view_pictures(pipeline: SSAPipeline, folder: Path) -> None:
         folder: exists; photo-1.jpg and clean-1.jpg are written, for a second camera photo-2.jpg, ...
     """
     photos = pipeline.datamanager.cached_train  # undistorts the photos and rewrites their cameras
-    cameras = pipeline.datamanager.train_dataset.cameras
-    _, groups = group_cameras(cameras)
-    artifacts = pipeline.model.artifacts
+    dataset = pipeline.datamanager.train_dataset
+    cameras, artifacts = dataset.cameras, pipeline.model.artifacts
+    keys, groups = group_cameras(cameras)
     if artifacts.changes:
-        groups = [artifacts.group_of_view(view) for view in range(len(photos))]
+        # A loaded model knows intervals by their photos, not by views.
+        places = _places(keys, artifacts)
+        names = pipeline.datamanager.photo_names(dataset)
+        shown = [artifacts.at_photo(places[group], name) for group, name in zip(groups, names, strict=True)]
+        groups = [group if group < len(artifacts) else None for group in shown]
     for group in sorted({group for group in groups if group is not None}):
         members = [view for view, at in enumerate(groups) if at == group]
         middle = members[len(members) // 2]

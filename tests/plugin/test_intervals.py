@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import yaml
 from conftest import edit_transforms
 from nerfstudio.utils.eval_utils import eval_setup
 from PIL import Image
@@ -21,6 +22,7 @@ from ssa_nerfstudio.export.capture_artifact import LearnedArtifact
 from ssa_nerfstudio.export.checkpoint import Checkpoint
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.workflow.finished_training import PicturedGroup, evaluate, write_view_pictures
+from ssa_nerfstudio.workflow.resumable_training import load_trained
 
 HALF = 12
 
@@ -96,6 +98,18 @@ def test_only_views_of_the_interval_have_an_overlay(trained, half):
     )
     assert torch.equal(clean["composite"], clean["rgb"])
     assert (behind["composite"] - behind["rgb"]).abs().mean() > 0.02
+
+
+def test_a_loaded_training_pictures_every_interval_with_an_overlay(trained, half, tmp_path):
+    """As `ssa run` does: the loaded model has never seen the training views."""
+    loaded = load_trained(yaml.load(trained[2].read_text(), Loader=yaml.Loader))
+    write_view_pictures(loaded, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"photo-1.jpg", "clean-1.jpg"}
+    bottom = np.asarray(Image.open(tmp_path / "photo-1.jpg"), float)[40:]
+    behind = [
+        np.asarray(Image.open(path), float)[40:] for path in sorted((half / "images").glob("train_*"))[HALF + 1 :]
+    ]
+    assert np.abs(bottom - np.mean(behind, axis=0)).mean() < 10, "it is behind the dashboard"
 
 
 def test_resuming_and_reloading_keep_the_intervals(trained, half, tmp_path, configure_training, train_and_evaluate):
