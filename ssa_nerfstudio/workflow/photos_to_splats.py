@@ -149,7 +149,7 @@ def _process(
     warning = f"no pose was found for {name_list(missing)}; where parts of the "
     warning += "scene are missing, add photos between them and their neighbors"
     repaired = "" if summary.repair is None else f"; of the model, {summary.repair.in_words()}"
-    masked = "; found off the artifact" if summary.masked else ""
+    masked = "; found without the artifact's pixels" if summary.masked else ""
     masked = "; more photos have poses without a mask of the artifact" if summary.unmasked else masked
     return Result(
         f"{registered} of {photos} photos have poses, {summary.points:,} points, mean reprojection error "

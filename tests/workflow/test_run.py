@@ -72,7 +72,7 @@ def test_it_continues_where_it_was_killed(finished):
 
 
 def test_structure_from_motion_masks_what_the_first_stage_found(finished):
-    assert results(finished)["process"].endswith("; found off the artifact")
+    assert results(finished)["process"].endswith("; found without the artifact's pixels")
     used = np.asarray(Image.open(finished / "dataset/mask_colmap.png"))
     found = np.asarray(Image.open(finished / "detection/mask_colmap.png"))
     assert not used[found == 0].any()
