@@ -57,7 +57,7 @@ class Command:
         """The folder to write to.
 
         Raises:
-            InputError: it is not given, and that of the data's name holds what no detection wrote.
+            InputError: it is not given, and that of the data's name holds what no detection wrote, or --json is there.
         """
         if self.output is not None:
             return self.output
@@ -70,6 +70,8 @@ class Command:
             raise InputError(
                 f"{place} {f'holds {other[0]}' if other else 'is a link'} and is not replaced", "choose an --output"
             )
+        if self.json not in (None, STANDARD_OUTPUT) and place.resolve() in self.json.resolve().parents:
+            raise InputError(f"--json {self.json} is in {place}, which is replaced", "name a file elsewhere")
         return place
 
     def run(self) -> None:
@@ -78,8 +80,6 @@ class Command:
         Raises:
             InputError: an option or a photo cannot be used.
         """
-        import shutil
-
         from ssa_nerfstudio.data.writing import staged_folder, write_text
         from ssa_nerfstudio.evidence.capture_detection import (
             detect_camera,
@@ -95,9 +95,7 @@ class Command:
         console = plain_console(stderr=printed)
         cameras = read_cameras(self.data, self.frames)
         found = {camera.name: detect_camera(camera, self.threads, console, self.draws) for camera in cameras}
-        if self.output is None:
-            shutil.rmtree(output, ignore_errors=True)
-        with staged_folder(output) as folder:
+        with staged_folder(output, replaces=self.output is None) as folder:
             write_detections(folder, found)
             if self.json is not None and not printed:
                 write_text(self.json, detections_to_json(found))

@@ -39,19 +39,20 @@ def unwritable_as_input_error(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def staged_folder(output: Path) -> Iterator[Path]:
+def staged_folder(output: Path, replaces: bool = False) -> Iterator[Path]:
     """Write a folder that appears when the block ends without an error, and not otherwise.
 
     Args:
         output: the folder to make. Its parents are made where missing.
+        replaces: whether it takes the place of an earlier folder, which goes once the new one is whole.
 
     Yields:
         An empty hidden folder beside `output`, renamed to `output` at the end.
 
     Raises:
-        InputError: `output` exists or cannot be written.
+        InputError: `output` exists, unless it is replaced, or cannot be written.
     """
-    if output.exists():
+    if output.exists() and not (replaces and output.is_dir()):
         raise _exists_already(output)
     with unwritable_as_input_error(output):
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -59,9 +60,14 @@ def staged_folder(output: Path) -> Iterator[Path]:
             folder = Path(scratch) / output.name
             folder.mkdir()
             yield folder
+            earlier = Path(scratch) / f"{output.name}.earlier"
             try:
+                if replaces and output.exists():
+                    output.rename(earlier)
                 folder.rename(output)
             except OSError as error:
+                if earlier.exists() and not output.exists():
+                    earlier.rename(output)
                 if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):  # another process was faster
                     raise _exists_already(output) from error
                 raise

@@ -34,6 +34,23 @@ def test_nothing_of_a_folder_is_left_after_an_error(tmp_path):
     assert names(tmp_path) == []
 
 
+def test_an_earlier_folder_is_replaced_at_the_end_or_stays(tmp_path):
+    output = tmp_path / "out"
+    for content in ("first", "second"):
+        with staged_folder(output, replaces=True) as folder:
+            (folder / content).write_text(content)
+            assert names(output) == ([] if content == "first" else ["first"])
+    with pytest.raises(Interrupted), staged_folder(output, replaces=True) as folder:
+        raise Interrupted
+    assert names(tmp_path) == ["out", "out/second"]
+    with pytest.raises(InputError, match="cannot be written"), staged_folder(output, replaces=True) as folder:
+        folder.rmdir()  # the swap fails half-way
+    assert names(tmp_path) == ["out", "out/second"]
+    (file := tmp_path / "file").write_text("content")
+    with pytest.raises(InputError, match="exists already"), staged_folder(file, replaces=True):
+        pass
+
+
 def test_a_folder_that_exists_or_cannot_be_written_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"exists already; remove it"), staged_folder(tmp_path):
         pass

@@ -121,6 +121,32 @@ def test_without_an_output_the_last_result_of_that_name_is_replaced(tmp_path, mo
     assert written == ["evidence.png", "mask_colmap.png", "mask_nerfstudio.png"]
 
 
+@pytest.fixture
+def detected(tmp_path, monkeypatch) -> dict[Path, bytes]:
+    """Files of a detection of ./walk, where it is written by default, and what is in them."""
+    monkeypatch.chdir(tmp_path)
+    photos(tmp_path / "walk", count=8)
+    main(["detect", "--data", "walk"])
+    return {path: path.read_bytes() for path in Path("outputs/detection/walk").iterdir()}
+
+
+def test_a_report_in_the_folder_that_is_replaced_is_refused(detected, capsys):
+    with pytest.raises(SystemExit) as refused:
+        main(["detect", "--data", "walk", "--json", "outputs/detection/walk/found.json"])
+    assert refused.value.code == 2
+    assert "--json outputs/detection/walk/found.json is in outputs/detection/walk, which" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in Path("outputs/detection/walk").iterdir()} == detected
+
+
+def test_a_full_disk_leaves_the_earlier_detection(detected):
+    command = 'ulimit -f 1; exec "$0" -m ssa_nerfstudio detect --data walk --threads 1'
+    done = subprocess.run(["bash", "-c", command, sys.executable], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "outputs/detection/walk cannot be written" in done.stderr
+    assert {path: path.read_bytes() for path in Path("outputs/detection/walk").iterdir()} == detected
+    assert [path.name for path in Path("outputs/detection").iterdir()] == ["walk"]
+
+
 def test_an_output_that_exists_is_left_alone(tmp_path, capsys):
     data = photos(tmp_path / "photos", count=8)
     with pytest.raises(SystemExit) as refused:
