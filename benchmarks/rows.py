@@ -1,12 +1,14 @@
 """A row for each capture and artifact: off, paper's rule, default and oracle: `python benchmarks/rows.py RESULTS`
 
-From results of `ssa bench captures`; PSNR in dB, means over seeds. With --methods, a column for each of them and the
-rows that all of them have: `python benchmarks/rows.py RESULTS --methods 3dgs desplat default default/mcmc`.
+From results of `ssa bench captures`; PSNR in dB, means over seeds. With --methods, a column for each of them, the rows
+that at least one of them has, and the mean over those that all of them have:
+`python benchmarks/rows.py RESULTS --methods 3dgs desplat default default/mcmc`.
 """
 
 from __future__ import annotations
 
 import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -44,21 +46,38 @@ def marked(difference: float | None) -> str:
     return f"{difference:+.2f}" if difference >= -MAX_LOSS else f"**{difference:+.2f}**"
 
 
-def side_by_side(study: Study, methods: tuple[str, ...]) -> str:
-    """A table of PSNR, a column for each method (`default`, or `default/mcmc`), and the mean of each over full rows."""
+def columns_of(methods: Sequence[str], compared: Sequence[Study]) -> list[tuple[str, str]]:
+    """Method and densification of each column.
+
+    Raises:
+        InputError: there are no results of one of them.
+    """
     columns = [(name, densification or "adc") for name, _, densification in (m.partition("/") for m in methods)]
+    there = {(r.run.method, r.run.densification): None for study in compared for r in study.results}
+    known = [name if densification == "adc" else f"{name}/{densification}" for name, densification in sorted(there)]
+    for method, column in zip(methods, columns, strict=True):
+        if column not in there:
+            raise InputError(f"--methods: there are no results of {method!r}", f"choose among {', '.join(known)}")
+    return columns
+
+
+def side_by_side(study: Study, methods: Sequence[str], columns: Sequence[tuple[str, str]]) -> str:
+    """A table of PSNR, a column for each method (`default`, or `default/mcmc`); empty where the study has none of them.
+
+    Rows are what at least one of them has, the mean is over those that all of them have.
+    """
     lines = [f"| | | {' | '.join(methods)} |", f"|{'---|' * (2 + len(methods))}"]
     full: list[list[float]] = []
     for effect, scene in sorted(study.pairs, key=lambda pair: pair[1]):
         row = [mean(study.select(effect, scene, *column), "psnr") for column in columns]
-        if any(value is not None for value in row[1:]):
+        if any(value is not None for value in row):
             lines.append(f"| `{scene}` | {effect} | {' | '.join('' if v is None else f'{v:.2f}' for v in row)} |")
         if None not in row:
             full.append([value for value in row if value is not None])
     if full:
         means = (statistics.mean(column) for column in zip(*full, strict=True))
         lines.append(f"| mean of {len(full)} | | {' | '.join(f'{value:.2f}' for value in means)} |")
-    return "\n".join(lines)
+    return "\n".join(lines) if len(lines) > 2 else ""
 
 
 @dataclass
@@ -69,21 +88,24 @@ class Command:
     """Output folders of `ssa bench`; several are added up."""
 
     methods: tuple[str, ...] = ()
-    """Columns: methods under ADC, or METHOD/mcmc. Empty: off, paper's rule, default and oracle under both."""
+    """Columns: methods under ADC, or METHOD/mcmc; rows are those that at least one has, the mean is over those that all
+    have. Empty: off, paper's rule, default and oracle under both."""
 
     def run(self) -> None:
         """Print.
 
         Raises:
-            InputError: there are no results.
+            InputError: there are no results, or none of a method.
         """
         results, _ = read_all([*self.folders])
         compared = [study for study in studies(results) if study.clean_tests]
         if not compared:
             raise InputError("no results with clean test photos", "name the --output of ssa bench captures")
+        chosen = columns_of(self.methods, compared)
         for study in compared:
-            if self.methods:
-                print(f"\n{study.title}\n\n{side_by_side(study, self.methods)}")
+            if chosen:
+                if table := side_by_side(study, self.methods, chosen):
+                    print(f"\n{study.title}\n\n{table}")
                 continue
             columns = ("off", "paper's rule", "default (worst view)", "oracle", "difference")
             heads = [f"{d.upper()}: {column}" for d in study.densifications for column in columns]

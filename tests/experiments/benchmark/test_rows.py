@@ -26,17 +26,41 @@ def test_a_row_compares_the_default_with_the_better_reference(tmp_path, capsys):
     assert "at most 0.3 dB behind" in printed
 
 
+def rows_of(printed: str) -> dict[tuple[str, str], list[str]]:
+    """The cells of each row of a table, by scene and effect."""
+    table = [[cell.strip() for cell in line.split("|")] for line in printed.splitlines() if "|" in line]
+    return {(scene, effect): values for _, scene, effect, *values, _ in table[2:]}
+
+
 def test_methods_side_by_side(tmp_path, capsys):
-    results = [r for r in all_results() if (r.run.scene, r.run.effect, r.run.method) != ("barn", "mud", "paper")]
+    missing = {("barn", "mud", "paper"), ("attic", "mud", "default")}
+    results = [r for r in all_results() if (r.run.scene, r.run.effect, r.run.method) not in missing]
     Command((folder_of(tmp_path, results),), ("paper", "default", "default/mcmc")).run()
-    table = [[cell.strip() for cell in line.split("|")] for line in capsys.readouterr().out.splitlines() if "|" in line]
-    rows = {(scene, effect): values for _, scene, effect, *values, _ in table[2:]}
+    rows = rows_of(capsys.readouterr().out)
     assert rows["`barn`", "mud"][0] == ""
+    assert rows["`attic`", "mud"][0] != ""
+    assert rows["`attic`", "mud"][1:] == ["", ""]
     (label,) = (scene for scene, _ in rows if scene.startswith("mean of"))
     whole = [values for (scene, _), values in rows.items() if "" not in values and scene != label]
     assert label == f"mean of {len(whole)}"
     for k, value in enumerate(rows[label, ""]):
         assert float(value) == pytest.approx(sum(float(values[k]) for values in whole) / len(whole), abs=0.006)
+
+
+def test_one_method_has_its_rows_and_their_mean(tmp_path, capsys):
+    Command((folder_of(tmp_path, all_results()),), ("default",)).run()
+    rows = rows_of(capsys.readouterr().out)
+    ((label, _), (mean,)) = rows.popitem()
+    assert rows
+    assert label == f"mean of {len(rows)}"
+    assert float(mean) == pytest.approx(sum(float(value) for (value,) in rows.values()) / len(rows), abs=0.006)
+
+
+def test_a_method_without_results_is_refused(tmp_path):
+    folder = folder_of(tmp_path, all_results())
+    for name in ("defalt", "default/adcs"):
+        with pytest.raises(InputError, match=rf"no results of '{name}'; choose among .*default, default/mcmc"):
+            Command((folder,), ("3dgs", name)).run()
 
 
 def test_a_folder_without_results_is_refused(tmp_path):
