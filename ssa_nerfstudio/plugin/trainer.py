@@ -41,8 +41,10 @@ from ssa_nerfstudio.plugin.validation import (
     check_intervals,
     check_length,
     check_machine,
+    check_optimizers,
     check_output,
     check_port,
+    check_reader,
     check_settings,
 )
 
@@ -78,6 +80,8 @@ class SSATrainerConfig(TrainerConfig):
         check_settings(self.pipeline.model, self.machine.device_type)
         check_length(self.max_num_iterations, self.pipeline.datamanager.camera_res_scale_factor)
         check_intervals(self)
+        check_optimizers(self.optimizers)
+        check_reader(self.pipeline.datamanager.dataparser)
 
 
 class SSATrainer(Trainer):

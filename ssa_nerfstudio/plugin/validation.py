@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.configs.base_config import MachineConfig
-from nerfstudio.data.dataparsers.base_dataparser import DataparserOutputs
+from nerfstudio.data.dataparsers.base_dataparser import DataParserConfig, DataparserOutputs
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.training_requirements import MIN_VIEWS
@@ -33,6 +34,7 @@ _LOWEST = {
     "mcmc_scale_regularizer": 0,
     "mcmc_scale_start": 1e-6,
     "mcmc_stop_at": 0,
+    "n_split_samples": 1,
     "num_downscales": 0,
     "num_random": 1,
     "pause_after_reset": 0,
@@ -50,6 +52,10 @@ _LOWEST = {
 _HIGHEST = {"sh_degree": 4, "ssim_lambda": 1}
 """Highest values: of nerfstudio's spherical harmonics, and of a share."""
 _MAX_SEED = 2**32 - 1
+_ABOVE_ZERO = ("optimizer.lr", "optimizer.eps", "optimizer.max_norm", "scheduler.lr_final", "scheduler.max_steps")
+"""Of a group's optimizer and schedule; what its kind lacks, or is None, is not checked. A decay is exponential, so that
+it neither begins nor ends at 0; without eps, a gradient of 0 divides by 0."""
+_FROM_ZERO = ("optimizer.weight_decay", "scheduler.lr_pre_warmup", "scheduler.warmup_steps")
 
 
 def check_machine(machine: MachineConfig) -> None:
@@ -105,8 +111,38 @@ def check_intervals(config: TrainerConfig) -> None:
         if (value := attrgetter(name)(config)) < least:
             raise InputError(f"--{name.replace('_', '-')} must be at least {least}, got {value}")
     for group, steps in config.gradient_accumulation_steps.items():
+        if group not in config.optimizers:
+            raise InputError(
+                f"--gradient-accumulation-steps: no parameters are called {group!r}",
+                f"choose of {', '.join(config.optimizers)}",
+            )
         if steps < 1:
             raise InputError(f"--gradient-accumulation-steps must be at least 1, got {steps} for {group}")
+
+
+def check_optimizers(optimizers: Mapping[str, Mapping[str, Any]]) -> None:
+    """Refuse numbers that Adam fails at, that move parameters away from their optimum, or that make them NaN.
+
+    Args:
+        optimizers: by group, the configurations of its "optimizer" and "scheduler", as nerfstudio's trainer has them.
+    """
+    for group, parts in optimizers.items():
+        for where in (*_ABOVE_ZERO, *_FROM_ZERO):
+            part, name = where.split(".")
+            value = getattr(parts.get(part), name, None)
+            if value is None or 0 < value < math.inf or (value == 0 and where in _FROM_ZERO):
+                continue
+            option = f"--optimizers.{group}.{where}".replace("_", "-")
+            raise InputError(
+                f"{option} must be finite and {'at least' if where in _FROM_ZERO else 'above'} 0, got {value}"
+            )
+
+
+def check_reader(reader: DataParserConfig) -> None:
+    """Refuse factors, for every reader that has them, that leave no scene, mirror it, or make its poses NaN."""
+    for name in ("scale_factor", "scene_scale"):
+        if not 0 < (value := getattr(reader, name, 1.0)) < math.inf:
+            raise InputError(f"--{name.replace('_', '-')} must be finite and above 0, got {value}", "1 keeps the size")
 
 
 def check_device(device: torch.device | str) -> None:
@@ -145,6 +181,9 @@ def check_settings(model: ModelSettings, device: torch.device | str) -> None:
     for name, value in vars(model).items():
         if isinstance(value, float) and math.isnan(value):
             raise InputError(f"--pipeline.model.{name.replace('_', '-')} is no number")
+    if model.use_bilateral_grid and min(model.grid_shape) < 1:
+        shape = " ".join(map(str, model.grid_shape))
+        raise InputError(f"--pipeline.model.grid-shape must be at least 1 in all directions, got {shape}")
     if not 0 <= model.clearance < 1:
         raise InputError(f"--pipeline.model.clearance must be in [0, 1), got {model.clearance}")
     if not 0 < model.mcmc_opacity_start < 1:

@@ -20,7 +20,10 @@ _INSTEAD = {
     "train": {"data": "PHOTOS", "max-num-iterations": "--steps"},
 }
 """What `ssa run` sets by itself."""
-_READER = re.compile(r"(?:pipeline\.datamanager\.dataparser\.|(?=(?:train-split-fraction|eval-interval|eval-mode)$))")
+_READER = re.compile(
+    r"(?:pipeline\.datamanager\.dataparser\.|"
+    r"(?=(?:train-split-fraction|eval-interval|eval-mode|scale-factor|scene-scale)$))"
+)
 """Options of the dataset's reader, which ns-train takes after its name."""
 _RESUME = re.compile(r"resume from .*--load-dir.*")
 
