@@ -42,7 +42,7 @@ MAX_CONTRAST = 0.5
 """Gradient per pixel that a change of the scene's mean brightness may cause at an artifact's edge, relative to that
 change: what is one pixel wide, and opaque, has a central difference of a half."""
 CONTRAST_RADIUS = 3
-"""Working pixels around an edge in which the scene's brightness is compared."""
+"""Working pixels around an edge in which the scene's brightness, and what else stands still, is compared."""
 MIN_MOTION = 0.15
 """From block to block, gradients within an interval change at least by this share of the squares outside of it; else
 the camera rests there, and all stands still. Five captures have at least 0.32, photos of one place at most 0.07."""
@@ -149,8 +149,8 @@ class _Scan:
     def _differs(self, start: int, end: int, first: int, last: int) -> bool:
         """Test one interval against the rest of its stretch at full working resolution.
 
-        Edges do not count where the scene moves, where a change of its brightness explains them, and where the camera
-        rests.
+        Edges do not count where the scene moves, where a change of its brightness explains them, where the camera
+        rests, and where most of what stands still around them stays: a video's keyframe encodes fine grain anew.
         """
         within, rest = [*range(start, end)], [*range(first, start), *range(end, last)]
         inside, outside = self._part(within), self._part(rest)
@@ -164,7 +164,8 @@ class _Scan:
             (outside, inside, motion <= 1 / MIN_MOTION),
         ):
             images, moments = part
-            edges = _only_in(*_summed(moments), *_summed(other[1])) & (change > MAX_CONTRAST * contrast)
+            sums, missing = _summed(moments), _summed(other[1])
+            edges = _only_in(*sums, *missing) & _mostly_missing(*sums, *missing) & (change > MAX_CONTRAST * contrast)
             if not enough or edges.float().mean() < MIN_CHANGED_SHARE:
                 continue
             moved = displaced_share(images, moments[:, :2].mean(dim=0), DISPLACEMENT_WINDOWS[0])
@@ -229,6 +230,16 @@ def _only_in(sums: Tensor, count: int, other: Tensor, other_count: int) -> Tenso
     least = EVIDENCE_THRESHOLDS[0] ** 2
     different = length + other_length - 2 * along >= least * (error + other_error)
     return (length >= least * error) & (along <= 0.5 * length) & different
+
+
+def _mostly_missing(sums: Tensor, count: int, other: Tensor, other_count: int) -> Tensor:
+    """Pixels [h, w] around which the other blocks lack at least half of the static edges, as in `_only_in`."""
+    mean, length, error = _mean_gradient(sums, count)
+    along = (mean * _mean_gradient(other, other_count)[0]).sum(dim=0)
+    still = length >= EVIDENCE_THRESHOLDS[0] ** 2 * error
+    planes = torch.stack([along * still, length * still])[None]
+    kept, there = nn.functional.avg_pool2d(planes, 2 * CONTRAST_RADIUS + 1, 1, CONTRAST_RADIUS)[0]
+    return kept <= 0.5 * there
 
 
 def _mean_gradient(sums: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
