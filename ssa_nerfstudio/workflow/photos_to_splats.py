@@ -35,6 +35,7 @@ from ssa_nerfstudio.export.exposure_file import write_exposure
 from ssa_nerfstudio.export.panorama_artifact import face_changes, panorama_layers
 from ssa_nerfstudio.export.splats import select, write_compressed_ply, write_ply
 from ssa_nerfstudio.overlay.rgba import to_rgba8
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
 from ssa_nerfstudio.sfm.detected_mask import FoundArtifact
 from ssa_nerfstudio.sfm.photos_to_dataset import Summary
@@ -174,23 +175,24 @@ def _train(plan: Plan, on_progress: ProgressCallback) -> Result:
     )
 
 
-def warn_of_missed_artifacts(plan: Plan, overlays: Sequence[str]) -> None:
+def warn_of_missed_artifacts(plan: Plan, artifacts: Artifacts) -> None:
     """Warn, before the first step, of what detection found and the training has no overlay for.
 
     Training tests undistorted photos, of a 360 degree camera the faces. Names of cameras may differ, so they are
-    counted.
+    counted, each once however many intervals it has.
 
     Args:
         plan: the run.
-        overlays: names of those that are trained.
+        artifacts: the overlays that are trained.
     """
+    trained = list(dict.fromkeys(artifacts.cameras[: len(artifacts)]))
     verdicts = _verdicts(plan)
     found = [name for name, verdict in verdicts.items() if verdict != "none"]
     # 360 degree photos are one camera for detection and up to six for training.
-    if len(found) <= len(overlays) or plan.training.pipeline.model.overlay == "off":
+    if len(found) <= len(trained) or plan.training.pipeline.model.overlay == "off":
         return
     of = f" of {name_list(found)}" if len(verdicts) > 1 else ""
-    learned = f"those of {name_list(overlays)}" if overlays else "none"
+    learned = f"those of {name_list(trained)}" if trained else "none"
     _LOG.warning(
         f"detection found an artifact in the photos{of}, the training in {learned}; if one is left in the splats, run "
         "with --train.pipeline.model.overlay on and another --output"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
@@ -13,6 +13,7 @@ from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocati
 from nerfstudio.utils import writer
 
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state, newest_first, step_of
@@ -25,14 +26,14 @@ def config_file(config: SSATrainerConfig) -> Path:
 
 
 def train(
-    config: SSATrainerConfig, on_progress: ProgressCallback, on_start: Callable[[Sequence[str]], None] = lambda _: None
+    config: SSATrainerConfig, on_progress: ProgressCallback, on_start: Callable[[Artifacts], None] = lambda _: None
 ) -> int:
     """Train up to the configuration's number of steps, from the newest checkpoint where there is one.
 
     Args:
         config: of a run whose folder has no time in its name, or a repeated call would start another one.
         on_progress: called after every step.
-        on_start: called before the first step with the names of the overlays (`Artifacts.name`).
+        on_start: called before the first step with the overlays.
 
     Returns:
         The step that it began at: 0, unless an earlier call left a checkpoint.
@@ -56,8 +57,7 @@ def train(
             on_progress("step", step + 1, config.max_num_iterations)
 
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after_step))
-        artifacts = trainer.pipeline.model.artifacts
-        on_start([artifacts.name(group) for group in range(len(artifacts))])
+        on_start(trainer.pipeline.model.artifacts)
         began = trainer._start_step
         trainer.train()
     finally:

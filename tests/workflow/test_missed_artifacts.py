@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.workflow.detection_folder import VERDICTS
 from ssa_nerfstudio.workflow.learned_artifacts import clear_overlays, learned_in_words, learned_shares
 from ssa_nerfstudio.workflow.photos_to_splats import DETECTION, warn_of_missed_artifacts
@@ -25,14 +29,27 @@ def layers(name: str, covered: int) -> ArtifactLayers:
     return ArtifactLayers(transmittance, np.zeros_like(transmittance), lens, "undistorted", "learned", name)
 
 
-def warn(folder: Path, caplog, verdicts: dict[str, str], overlays: list[str], overlay: str = "auto") -> list[str]:
-    """What is warned of where detection found this, and the training has overlays of these names."""
+def overlays_of(covered: list[str], bare: list[str]) -> Artifacts:
+    """Overlays of these cameras, one for each time that a camera is named, and others without any."""
+    cameras = covered + bare
+    keys = torch.tensor([[4, 3, number, number, 2, 1.5] for number in map(cameras.index, cameras)], dtype=torch.float64)
+    starts = [f"images/{number}.png" for number in range(len(cameras))]
+    made = Artifacts()
+    overlays = [ScreenSpaceOverlay(3, 4) for _ in covered] + [None] * len(bare)
+    made.assign(overlays, keys.reshape(-1, 6), [], torch.zeros(len(cameras), 16), starts, cameras)
+    return made
+
+
+def warn(
+    folder: Path, caplog, verdicts: dict[str, str], covered: list[str], overlay: str = "auto", bare: Sequence[str] = ()
+) -> list[str]:
+    """What is warned of where detection found this, and the training has overlays of these cameras."""
     (folder / DETECTION).mkdir()
     groups = [{"name": name, "verdict": verdict} for name, verdict in verdicts.items()]
     (folder / DETECTION / VERDICTS).write_text(json.dumps({"groups": groups}))
     model = SimpleNamespace(overlay=overlay)
     plan = SimpleNamespace(output=folder, training=SimpleNamespace(pipeline=SimpleNamespace(model=model)))
-    warn_of_missed_artifacts(plan, overlays)  # type: ignore[arg-type]
+    warn_of_missed_artifacts(plan, overlays_of(covered, [*bare]))  # type: ignore[arg-type]
     return caplog.messages
 
 
@@ -44,6 +61,7 @@ def warn(folder: Path, caplog, verdicts: dict[str, str], overlays: list[str], ov
         ({"front": "none"}, ["camera_0"], "auto"),
         ({"frame": "opaque"}, ["frame_down", "frame_right"], "auto"),
         ({"front": "faint"}, [], "off"),
+        ({"front": "opaque"}, ["front", "front"], "auto"),
     ],
 )
 def test_there_is_none_where_all_was_learned_or_nothing_was_wanted(tmp_path, caplog, verdicts, overlays, overlay):
@@ -56,10 +74,12 @@ def test_there_is_none_where_all_was_learned_or_nothing_was_wanted(tmp_path, cap
         ({"left": "faint", "right": "opaque"}, ["left"], "the photos of left, right, the training in those of left;"),
         ({"left": "faint", "right": "none"}, [], "the photos of left, the training in none;"),
         ({"camera_0": "faint"}, [], "the photos, the training in none;"),
+        ({"front": "faint", "side": "faint"}, ["front", "front"], "front, side, the training in those of front;"),
     ],
 )
 def test_an_artifact_that_training_did_not_see_is_named_with_the_remedy(tmp_path, caplog, verdicts, overlays, said):
-    (warning,) = warn(tmp_path, caplog, verdicts, overlays)
+    bare = [name for name in verdicts if name not in overlays]
+    (warning,) = warn(tmp_path, caplog, verdicts, overlays, bare=bare)
     assert said in warning
     assert "--train.pipeline.model.overlay on" in warning
 

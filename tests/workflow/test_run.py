@@ -20,6 +20,7 @@ from small_captures import HEIGHT, WIDTH, write
 from benchmarks import viewer_screenshots
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.workflow import photos_to_splats
 
 VIEWS = 16
@@ -167,8 +168,8 @@ def test_a_dataset_whose_test_photos_are_clean_and_options_of_its_stages(tiny_sc
 
 
 def test_a_missed_artifact_is_told_of_before_the_first_step(tiny_scene, tmp_path, monkeypatch, capsys):
-    def stop(plan: object, overlays: list[str]) -> None:
-        raise InputError(f"there are overlays {overlays}")
+    def stop(plan: object, artifacts: Artifacts) -> None:
+        raise InputError(f"there are overlays {[artifacts.name(group) for group in range(len(artifacts))]}")
 
     monkeypatch.setattr(photos_to_splats, "warn_of_missed_artifacts", stop)
     with pytest.raises(SystemExit):
