@@ -42,8 +42,11 @@ class Command:
         """Try what is left, and write OUTPUT/ROOM.md.
 
         Raises:
-            InputError: there is no such folder.
+            InputError: there is no such folder, or a number cannot be used.
         """
+        for name, lowest in (("sample", 0), ("children", 1), ("budget", 1)):
+            if not getattr(self, name) >= lowest:
+                raise InputError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
         rooms = [ChangedFolder(name, self.output.resolve() / name) for name in self._names()]
         before = {room: room.prepared() for room in rooms}
         every = [(room, change) for room in rooms for change in sorted(before[room])]

@@ -39,13 +39,16 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
-        (["--help"], 0, "usage: python benchmarks/contact_sheet.py"),
-        (["a.png", "--fiel"], 2, "--fiel"),
-        (["nowhere/a.png"], 2, "nowhere/a.png cannot be written; name a .png file in a folder that exists"),
+        (["contact_sheet.py", "--help"], 0, "usage: python benchmarks/contact_sheet.py"),
+        (["contact_sheet.py", "a.png", "--fiel"], 2, "--fiel"),
+        (["contact_sheet.py", "nowhere/a.png"], 2, "nowhere/a.png cannot be written; name a .png file in a folder"),
+        (["mutants.py", "--sample", "-3"], 2, "--sample must be at least 0, got -3"),
+        (["mutants.py", "--children", "0"], 2, "--children must be at least 1, got 0"),
+        (["mutants.py", "--budget", "nan"], 2, "--budget must be at least 1, got nan"),
     ],
 )
 def test_a_script_ends_as_a_command_does(arguments, code, said):
-    command = [sys.executable, "benchmarks/contact_sheet.py", *arguments]
+    command = [sys.executable, f"benchmarks/{arguments[0]}", *arguments[1:]]
     done = subprocess.run(command, cwd=FOLDER.parent, capture_output=True, text=True, timeout=100)
     assert done.returncode == code
     assert said in (done.stderr if code else done.stdout)
