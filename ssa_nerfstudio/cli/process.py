@@ -50,7 +50,7 @@ class Command:
     frames: int = 200
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighborhood."""
     min_registered: float = 0.5
-    """Stop when less than this share of a pass's photos is registered."""
+    """Stop when less than this share of a pass's photos is registered; 0: when none is."""
     projection: Projection = "auto"
     """What the photos are. fisheye gets lenses of OPENCV_FISHEYE, which training undistorts. Equirectangular (360
     degrees, 2:1) photos are cut into six perspective faces. auto takes 2:1 photos for such whose left edge continues

@@ -167,6 +167,8 @@ def process(
             if any(each.stands_still() for each in evidence):
                 problem = f"{error.problem}: nothing in them moves, as in copies of one photo or from a tripod"
                 raise InputError(problem, "take photos from several places") from error
+            if not min_registered:
+                raise  # no other share helps
             work.keep_after_error = True
             remedy = (
                 f"{error.remedy}; the same command with a lower --min-registered continues (its work is in {work.path})"

@@ -89,7 +89,7 @@ def check_registrations(
                 remedy = f"look whether the mask is black on the artifact (else --invert-mask), or {remedy}"
             raise InputError(
                 f"only {each.count} of {_photos_of(each.name, passes, f'{each.photos} photos')} could be registered, "
-                f"{min_share:.0%} are required",
+                f"{f'{min_share:.0%} are' if min_share else 'at least one is'} required",
                 remedy,
             )
 

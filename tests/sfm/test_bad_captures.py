@@ -107,6 +107,13 @@ def test_photos_that_show_nothing_in_common_stop_the_command(tmp_path, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == [".out.work", "photos"]
 
 
+def test_no_lower_requirement_than_none_is_proposed(tmp_path, capsys):
+    write(tmp_path / "photos", noise(4))
+    line = refused(capsys, tmp_path, "--min-registered", "0", "--threads", "1")
+    assert "only 0 of 4 photos could be registered, at least one is required; mask what covers" in line
+    assert "--min-registered" not in line
+
+
 def test_copies_of_one_photo_are_not_told_to_overlap_more(tmp_path, photos, capsys):
     write(tmp_path / "photos", [photos(12)[0]] * 8)
     line = refused(capsys, tmp_path, "--threads", "1")
