@@ -39,7 +39,7 @@ class Command:
     frame: Literal["auto", "raw", "undistorted"] = "auto"
     """Photos with or without the lens' distortion; auto: what the program takes best."""
     threshold: float = 0.5
-    """Matte above which a pixel is artifact, in (0, 1)."""
+    """Matte above which a pixel is artifact, in (0, 1); needs --load-config."""
     downscale_factor: int = 1
     """N > 1 reads images_N."""
 
@@ -53,6 +53,13 @@ class Command:
             raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")
         if self.load_config is None and self.data is None:
             raise InputError("there is nothing to export", "give --load-config of a run, or --data of a dataset")
+        for option, asked in (
+            ("--downscale-factor", self.downscale_factor != 1),
+            ("--photos cleaned", self.photos == "cleaned"),
+            ("--threshold", self.threshold != Command.threshold),
+        ):
+            if asked and self.load_config is None:
+                raise InputError(f"{option} takes the overlay of a run", "add --load-config")
         if self.output.exists():
             raise InputError(f"{self.output} exists already", "remove it or choose another --output")
         from rich.progress import track
@@ -89,7 +96,5 @@ class Command:
 
         if self.load_config is not None:
             return LearnedArtifact(Checkpoint.read(self.load_config), self.threshold)
-        if self.downscale_factor != 1 or self.photos == "cleaned":
-            raise InputError("this takes the overlay of a run", "add --load-config")
         lenses = [view.lens for view in dataset.views if view.role == "train"]
         return DetectedArtifact(lenses, list(detect_artifacts(data).values()))
