@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import sys
 import warnings
@@ -11,6 +12,7 @@ from types import TracebackType
 
 from ssa_nerfstudio._system.terminal_messages import print_error, refusal, show_warnings
 from ssa_nerfstudio.errors import InputError, SSAError, TrainingStopped
+from ssa_nerfstudio.plugin.config_tags import refuse_calls
 from ssa_nerfstudio.plugin.training.checkpoints import reason
 
 
@@ -36,6 +38,19 @@ def report_in_one_line() -> None:
         former(kind, error, traceback)
 
     sys.excepthook = hook
+
+
+def check_config() -> None:
+    """Look at the run of this `ns-*` command's `--load-config` before nerfstudio executes it.
+
+    Raises:
+        InputError: see `config_tags.refuse_calls`.
+    """
+    if is_nerfstudio_command():
+        for option, value in itertools.pairwise([*sys.argv, ""]):
+            name, _, joined = option.partition("=")
+            if name.replace("_", "-") == "--load-config":
+                refuse_calls(Path(joined or value))
 
 
 def _unreadable_run(error: BaseException, traceback: TracebackType | None) -> InputError | None:

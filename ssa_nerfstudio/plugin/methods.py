@@ -20,6 +20,7 @@ from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 
 # Every nerfstudio command imports this module through the entry points, before it loads or renders anything.
 command_entry.report_in_one_line()
+command_entry.check_config()
 versions.check_versions()
 open3d_libraries.preload()
 nerfstudio_repairs.allow_checkpoint_scalars()
