@@ -73,6 +73,11 @@ class SSAPipeline(VanillaPipeline):
         check_device(device)
         check_settings(config.model, device)
         source = _source(config)
+        if test_mode != "val" and not source.exists():
+            raise InputError(
+                f"{source}, which the run was trained on, does not exist",
+                "put it there again" if source.is_absolute() else "call the command where the training was called",
+            )
         if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
             transforms, parser = Transforms.read(source), config.datamanager.dataparser
             check_training(transforms, parser.downscale_factor, ("train", "val" if test_mode == "val" else "test"))

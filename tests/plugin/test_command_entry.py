@@ -13,6 +13,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 import torch
+import yaml
 
 from ssa_nerfstudio.errors import InputError, TrainingStopped
 from ssa_nerfstudio.plugin.artifacts import Artifacts
@@ -266,3 +267,15 @@ def test_no_command_opens_with_warnings_of_libraries_about_each_other(module, sh
         report_in_one_line()
         warnings.warn_explicit("use another", FutureWarning, "file.py", 1, module)
     assert len(seen) == shown
+
+
+@pytest.mark.parametrize(
+    ("data", "remedy"),
+    [("scene", "call the command where the training was called"), ("/nowhere/scene", "put it there again")],
+)
+def test_a_dataset_that_is_elsewhere(data, remedy, refused, run, tmp_path):
+    config = yaml.load((run / "config.yml").read_text(), Loader=yaml.Loader)
+    config.pipeline.datamanager.data = Path(data)
+    (tmp_path / "config.yml").write_text(yaml.dump(config))
+    line = refused("ns-eval", "--load-config", tmp_path / "config.yml")
+    assert line == f"{data}, which the run was trained on, does not exist; {remedy}"
