@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 from hard_cases import Case, Family
 from torch import Tensor
@@ -20,6 +21,11 @@ SIZE = (6, 8, 3)
 
 def photos(views: int, size: tuple[int, int, int] = SIZE, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).integers(0, 256, (views, *size), dtype=np.uint8)
+
+
+def on_device(array: np.ndarray | list) -> Tensor:
+    """A tensor on the default device."""
+    return torch.from_numpy(np.asarray(array)).to(torch.get_default_device())
 
 
 def started(statistics: ImageStatistics, resolution: int = 1) -> ScreenSpaceOverlay:
@@ -43,8 +49,7 @@ def started(statistics: ImageStatistics, resolution: int = 1) -> ScreenSpaceOver
 def stream(images: np.ndarray | list, masks: list | None = None) -> ImageStatistics:
     masks = masks or [None] * len(images)
     return accumulate(
-        (torch.from_numpy(np.asarray(image)), None if mask is None else torch.from_numpy(mask))
-        for image, mask in zip(images, masks, strict=True)
+        (on_device(image), None if mask is None else on_device(mask)) for image, mask in zip(images, masks, strict=True)
     )
 
 
@@ -72,14 +77,14 @@ def _flat(value: int) -> None:
 def _bit(base: int) -> None:
     noisy = np.full((40, *SIZE), base, np.uint8) + (photos(40) % 2)
     statistics = stream(noisy)
-    np.testing.assert_allclose(statistics.deviation().numpy(), exact(noisy, 255)[1], rtol=1e-12)
+    np.testing.assert_allclose(statistics.deviation().numpy(force=True), exact(noisy, 255)[1], rtol=1e-12)
     started(statistics)
 
 
 @STATISTICS.case("two views", "The fewest views there can be: a deviation over n - 1 would be over 1.")
 def _() -> None:
     pair = photos(2)
-    np.testing.assert_allclose(stream(pair).deviation().numpy(), exact(pair, 255)[1], rtol=1e-12)
+    np.testing.assert_allclose(stream(pair).deviation().numpy(force=True), exact(pair, 255)[1], rtol=1e-12)
     started(stream(pair))
 
 
@@ -94,8 +99,8 @@ def _() -> None:
     ramp = np.arange(10_000) % 256
     for value in ramp:
         statistics.add(torch.full(SIZE, int(value), dtype=torch.uint8))
-    np.testing.assert_allclose(statistics.mean().numpy(), ramp.mean() / 255, rtol=1e-12)
-    np.testing.assert_allclose(statistics.deviation().numpy(), ramp.std() / 255, rtol=1e-12)
+    np.testing.assert_allclose(statistics.mean().numpy(force=True), ramp.mean() / 255, rtol=1e-12)
+    np.testing.assert_allclose(statistics.deviation().numpy(force=True), ramp.std() / 255, rtol=1e-12)
     started(statistics)
 
 
@@ -114,8 +119,8 @@ def _() -> None:
     deep = np.random.default_rng(1).integers(0, 65536, (300, *SIZE), dtype=np.uint16)
     statistics = stream(deep)
     mean, deviation = exact(deep, 65535)
-    np.testing.assert_allclose(statistics.mean().numpy(), mean, rtol=1e-12)
-    np.testing.assert_allclose(statistics.deviation().numpy(), deviation, rtol=1e-12)
+    np.testing.assert_allclose(statistics.mean().numpy(force=True), mean, rtol=1e-12)
+    np.testing.assert_allclose(statistics.deviation().numpy(force=True), deviation, rtol=1e-12)
     started(statistics)
 
 
@@ -124,7 +129,7 @@ def _() -> None:
 def _float(noise: float) -> None:
     values = (0.9 - noise * np.random.default_rng(2).random((50, *SIZE)) * 0.9).astype(np.float32)
     statistics = stream(values)
-    np.testing.assert_allclose(statistics.deviation().numpy(), exact(values, 1.0)[1], rtol=1e-6)
+    np.testing.assert_allclose(statistics.deviation().numpy(force=True), exact(values, 1.0)[1], rtol=1e-6)
     started(statistics)
 
 
@@ -181,7 +186,7 @@ def _reduced(resolution: int) -> None:
     "photos of two depths", "0 to 255 and 0 to 65535 would be added.", torch.zeros(SIZE, dtype=torch.uint16)
 )
 def _mixed(stranger: Tensor) -> None:
-    statistics = stream(photos(2))
+    statistics, stranger = stream(photos(2)), stranger.to(torch.get_default_device())
     before = statistics.mean()
     try:
         statistics.add(stranger.to(torch.uint8) if stranger.dtype == torch.float32 else stranger)
@@ -216,8 +221,8 @@ def _detected(images: np.ndarray) -> None:
 def estimated(points: Tensor, images: np.ndarray, masks: list | None = None) -> LayerEstimate:
     """Estimate layers from points in front of a camera that looks along z in every view; and start an overlay."""
     K = torch.tensor([[8.0, 0.0, 4.0], [0.0, 8.0, 3.0], [0.0, 0.0, 1.0]])
-    torn = [None if mask is None else torch.from_numpy(mask) for mask in masks or [None] * len(images)]
-    views = [View(torch.from_numpy(image), mask, torch.eye(4), K) for image, mask in zip(images, torn, strict=True)]
+    torn = [None if mask is None else on_device(mask) for mask in masks or [None] * len(images)]
+    views = [View(on_device(image), mask, torch.eye(4), K) for image, mask in zip(images, torn, strict=True)]
     statistics = stream(images, masks)
     found = estimate(sample_points(points, views), guide_of(statistics), torch.zeros(statistics.size, dtype=torch.bool))
     for layer in (found.transmittance, found.addition):
@@ -234,9 +239,9 @@ def estimated(points: Tensor, images: np.ndarray, masks: list | None = None) -> 
 
 def scattered(count: int = 40) -> Tensor:
     """Points in the frame, at depths of 1 to 3."""
-    points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    points = torch.rand(count, 3, generator=torch.Generator("cpu").manual_seed(0), device="cpu") - 0.5
     points[:, 2] = 2 + 2 * points[:, 2]
-    return points
+    return points.to(torch.get_default_device())
 
 
 @STATISTICS.case("points in photos of one color", "Colors without variance: a regression over 0 / 0.")
@@ -289,3 +294,12 @@ def _() -> None:
 @STATISTICS.parametrize
 def test_statistics_and_start(case: Case) -> None:
     case.check()
+
+
+@pytest.mark.stability
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@STATISTICS.parametrize
+def test_statistics_and_start_on_cuda(case: Case) -> None:
+    """As where nerfstudio caches the photos on the GPU."""
+    with torch.device("cuda"):
+        case.check()
