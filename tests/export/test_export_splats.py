@@ -166,13 +166,18 @@ def test_contradicting_options_are_refused(tmp_path, capsys, options, complaint)
     assert not (tmp_path / "out").exists()
 
 
+def damage(checkpoint: Path, seed: int) -> None:
+    """Change a bit of the means of `random_gaussians(4, seed=seed)`."""
+    content = bytearray(checkpoint.read_bytes())
+    content[content.index(random_gaussians(4, seed=seed)["means"].numpy().tobytes())] ^= 1
+    checkpoint.write_bytes(content)
+
+
 def test_the_newest_whole_checkpoint_is_exported_and_the_others_are_named(tmp_path, caplog):
     config = write_run(tmp_path / "run", None, random_gaussians(4, seed=1), step=5)
     write_run(tmp_path / "run", None, random_gaussians(4, seed=2), step=9)
     newest = tmp_path / "run/nerfstudio_models/step-000000009.ckpt"
-    content = bytearray(newest.read_bytes())
-    content[content.index(random_gaussians(4, seed=2)["means"].numpy().tobytes())] ^= 1
-    newest.write_bytes(content)
+    damage(newest, seed=2)
     found = Checkpoint.read(config)
     assert found.step == 5
     assert torch.equal(found.gaussians()["means"], random_gaussians(4, seed=1)["means"])
@@ -180,6 +185,24 @@ def test_the_newest_whole_checkpoint_is_exported_and_the_others_are_named(tmp_pa
     assert "--step chooses one" in caplog.text
     with pytest.raises(InputError, match=r"checksum .* choose another with --step: there are 9, 5"):
         Checkpoint.read(config, step=9)
+
+
+@pytest.mark.parametrize(("broken", "read"), [([3], 2), ([3, 2], 1)])
+def test_no_whole_checkpoint_is_passed_over(broken, read, tmp_path, caplog):
+    for step in (1, 2, 3):
+        config = write_run(tmp_path / "run", None, random_gaussians(4, seed=step), step=step)
+    for step in broken:
+        damage(tmp_path / f"run/nerfstudio_models/step-{step:09d}.ckpt", seed=step)
+    assert Checkpoint.read(config).step == read
+    assert len(caplog.messages) == len(broken)
+
+
+def test_no_older_checkpoint_is_promised_where_there_is_none(tmp_path, caplog):
+    config = write_run(tmp_path / "run", None, random_gaussians(4, seed=1))
+    damage(tmp_path / "run/nerfstudio_models/step-000000009.ckpt", seed=1)
+    with pytest.raises(InputError, match="copy it again or train again"):
+        Checkpoint.read(config)
+    assert caplog.messages == []
 
 
 @OFTEN

@@ -14,8 +14,9 @@ from small_checkpoints import one_camera, write_run
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.data.dataset import Dataset
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.export.artifact_layers import ArtifactLayers
-from ssa_nerfstudio.export.restoration import recoverable, restore, shows
+from ssa_nerfstudio.export.restoration import fitting, recoverable, restore, shows
 from ssa_nerfstudio.overlay.layer import OracleOverlay
 
 WIDTH, HEIGHT = 240, 160
@@ -124,3 +125,16 @@ def test_a_folder_of_photos_without_the_artifact_is_refused(run, tmp_path, capsy
     assert ended.value.code == 2
     assert "none of the photos in " in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize(("width", "fits"), [(480, True), (482, True), (478, True), (484, False), (476, False)])
+def test_photos_of_another_size_fit_where_rounding_explains_their_aspect(tmp_path, width, fits):
+    """The frame is 240 x 160: at twice its size, 480 x 320, a column is 0.2 % of the aspect."""
+    frame = layers_of(np.ones((HEIGHT, WIDTH, 3), np.float32), np.zeros((HEIGHT, WIDTH, 3), np.float32))
+    path = tmp_path / "photo.png"
+    Image.new("RGB", (width, 320)).save(path)
+    if fits:
+        assert fitting(path, [frame]) is frame
+    else:
+        with pytest.raises(InputError, match=f"is {width} x 320, the overlay's frame 240 x 160"):
+            fitting(path, [frame])

@@ -18,6 +18,7 @@ from PIL import Image
 from benchmarks.guard_cost import Training
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import Detection
+from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin import overlay_setup as first_look
@@ -176,6 +177,28 @@ def test_too_few_static_edges_are_called_that(tiny_scene, tmp_path, capsys, monk
         "without an overlay. (--pipeline.model.overlay on trains with one.)"
         in " ".join(capsys.readouterr().out.split())
     )
+
+
+@pytest.mark.parametrize(("rows", "learned"), [(0, False), (2, True)])
+def test_soft_artifacts_are_learned_from_a_fiftieth_of_the_frame_on(
+    rows, learned, clean_scene, tmp_path, capsys, monkeypatch, configure_training
+):
+    """Detection sees no edges of them; the estimate from points says that they hide two rows of 48, 4.2 %."""
+    estimate = first_look.estimate
+
+    def soft(*arguments: Any) -> LayerEstimate:
+        found = estimate(*arguments)
+        assert found.transmittance.shape[0] == 48
+        transmittance = torch.ones_like(found.transmittance)
+        transmittance[:rows] = 0.5
+        addition, falloff = torch.zeros_like(found.addition), torch.ones_like(found.falloff)
+        return replace(found, transmittance=transmittance, addition=addition, falloff=falloff)
+
+    monkeypatch.setattr(first_look, "estimate", soft)
+    config = configure_training("ssa-splatfacto", clean_scene, tmp_path, 1)
+    assert len(config.pipeline.setup(device="cpu").model.artifacts) == learned
+    told = " ".join(capsys.readouterr().out.split())
+    assert ("have a static artifact (soft, 4.2% of the undistorted frame)" in told) == learned
 
 
 def test_a_constant_start_looks_at_no_photo(tiny_scene, tmp_path, configure_training):

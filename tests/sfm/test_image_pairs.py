@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,3 +33,18 @@ def test_pairs_are_of_different_photos_each_once_and_connect_all(counts):
     assert len(sequential) <= 16 * len(names) + 60 * 59 * 2 + 60 * 60
     if sum(counts) <= 40:
         assert len(exhaustive_pairs(passes)) == len(names) * (len(names) - 1) // 2
+
+
+def test_photos_are_paired_with_their_neighbors_in_time_and_at_growing_distances():
+    photos = list(range(1200))
+    pairs = sequential_pairs([[str(photo) for photo in photos]])
+    # Not a keyframe, which is paired with others far away.
+    assert sorted(int(other) - 1 for one, other in pairs if one == "1") == [*range(1, 11), 16, 32, 64, 128, 256, 512]
+
+
+def test_a_few_photos_of_each_pass_are_paired_with_those_of_the_others():
+    passes = [[f"{letter}{photo}" for photo in range(400)] for letter in "abcde"]
+    pairs = sequential_pairs(passes)
+    for one, other in combinations("abcde", 2):
+        across = [pair for pair in pairs if (pair[0][0], pair[1][0]) == (one, other)]
+        assert len(across) == 30 * 30

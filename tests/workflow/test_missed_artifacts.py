@@ -91,6 +91,14 @@ def test_an_overlay_that_stayed_clear_is_named():
     assert clear_overlays([]) == []
 
 
+@pytest.mark.parametrize(("hidden", "clear"), [(0, True), (1, True), (3, False)])
+def test_what_hides_less_than_a_thousandth_of_the_frame_is_nearly_clear(hidden, clear):
+    transmittance = np.ones((30, 40, 3), np.float32)  # a pixel is 0.083 % of it
+    transmittance.reshape(-1, 3)[:hidden] = 0
+    dot = replace(layers("dot", 0), transmittance=transmittance, addition=np.zeros_like(transmittance))
+    assert bool(clear_overlays([dot])) == clear
+
+
 def test_what_was_learned_is_called_by_what_the_overlays_are_of():
     front, side = layers("front", 9), layers("side", 1)
     assert learned_in_words([], False) == "the scene alone was learned"

@@ -8,6 +8,8 @@ import shlex
 import shutil
 from pathlib import Path
 
+import pytest
+
 from ssa_nerfstudio.cli import arguments
 from ssa_nerfstudio.workflow.choices import Choices
 from ssa_nerfstudio.workflow.finished_training import Evaluation, PicturedGroup
@@ -52,3 +54,9 @@ def test_a_run_without_an_overlay_offers_nothing_that_needs_one(tiny_scene, tmp_
     (capture,) = (command for command in alone.values() if "export-dataset" in command)
     assert "--load-config" not in capture
     assert str(os.path.relpath(tiny_scene, tmp_path)) in capture
+
+
+@pytest.mark.parametrize(("steps", "saved_every"), [(10, 1), (2_000, 100), (30_000, 1_500), (200_000, 2_000)])
+def test_a_training_that_is_killed_loses_a_twentieth_and_2000_steps_at_most(steps, saved_every, tiny_scene, tmp_path):
+    options = Choices(tiny_scene, "ssa-splatfacto", steps, 1.0).training_options(tmp_path)
+    assert options[options.index("--steps-per-save") + 1] == str(saved_every)
