@@ -1,6 +1,6 @@
 """Functions of fixed shapes as CUDA graphs: one launch for their values, one for their gradients.
 
-A training step of splats waits for its host, which launches some two hundred kernels one by one. It does so unless
+A training step of splats waits for its host, which launches some hundred kernels one by one. It does so unless
 SSA_CUDA_GRAPHS=1; the kernels are the same.
 """
 
@@ -260,11 +260,15 @@ class RecordedChanges:
 
 @contextmanager
 def parameters_replaced(module: nn.Module, tensors: Sequence[Tensor]) -> Iterator[None]:
-    """Let a module compute with other tensors in place of its parameters, in the order of `parameters()`."""
+    """Let a module compute with other tensors in place of its parameters, in the order of `parameters()`.
+
+    As there, a parameter that is None is left out, and one that has several places counts once.
+    """
     places = [(each, name) for each in module.modules() for name in each._parameters]
     held = [each._parameters[name] for each, name in places]
-    for (each, name), tensor in zip(places, tensors, strict=True):
-        each._parameters[name] = tensor  # pyright: ignore[reportArgumentType]
+    other = {id(mine): given for mine, given in zip(module.parameters(), tensors, strict=True)}
+    for (each, name), parameter in zip(places, held, strict=True):
+        each._parameters[name] = other.get(id(parameter))  # pyright: ignore[reportArgumentType]
     try:
         yield
     finally:

@@ -1,8 +1,9 @@
-"""From splatfacto's parameters to a render; while training on CUDA, the projection is one CUDA graph.
+"""From splatfacto's parameters to a render.
 
-What is recorded are the activations of the parameters and the projection. Spherical harmonics cannot be (`cuda.shade`),
-nor can sorting and blending: the number of tiles that the Gaussians cover differs from view to view. A refinement makes
-other Gaussians, and with them new recordings.
+With SSA_CUDA_GRAPHS=1, the projection is one CUDA graph while training. What is recorded are the activations of the
+parameters and the projection. Spherical harmonics cannot be (`cuda.shade`), nor can sorting and blending: the number of
+tiles that the Gaussians cover differs from view to view. A refinement makes other Gaussians, and with them new
+recordings.
 """
 
 from __future__ import annotations
