@@ -7,13 +7,12 @@ import shlex
 import sys
 import warnings
 from pathlib import Path
-from traceback import walk_tb
 from types import TracebackType
 
 from ssa_nerfstudio._system.terminal_messages import print_error, refusal, show_warnings
-from ssa_nerfstudio.errors import InputError, SSAError, TrainingStopped
+from ssa_nerfstudio.errors import SSAError, TrainingStopped
 from ssa_nerfstudio.plugin.config_tags import refuse_calls
-from ssa_nerfstudio.plugin.training.checkpoints import reason
+from ssa_nerfstudio.plugin.failed_commands import culprit
 
 
 def report_in_one_line() -> None:
@@ -30,7 +29,7 @@ def report_in_one_line() -> None:
     former = sys.excepthook
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
-        known = refusal(error) or _unreadable_run(error, traceback) or error
+        known = refusal(error) or culprit(error, traceback) or error
         if isinstance(error, KeyboardInterrupt):
             known = TrainingStopped(f"{Path(sys.argv[0]).name} was stopped before it began")
         if isinstance(known, SSAError):
@@ -51,28 +50,6 @@ def check_config() -> None:
             name, _, joined = option.partition("=")
             if name.replace("_", "-") == "--load-config":
                 refuse_calls(Path(joined or value))
-
-
-def _unreadable_run(error: BaseException, traceback: TracebackType | None) -> InputError | None:
-    """What nerfstudio could not read of the run of --load-config; None where it read the run, or was not reading.
-
-    Its function asserts, and calls libraries with whatever the files hold; its variables say how far it came.
-    """
-    if not isinstance(error, Exception) or isinstance(error, SSAError):
-        return None
-    frames = [f for f, _ in walk_tb(traceback) if f.f_globals.get("__name__") == "nerfstudio.utils.eval_utils"]
-    variables = {frame.f_code.co_name: frame.f_locals for frame in frames}
-    if (here := variables.get("eval_load_checkpoint")) is not None:
-        path = here.get("load_path", here["config"].load_dir)
-        return InputError(
-            f"{path} cannot be read as a checkpoint ({reason(error)})", "copy it again, remove it, or train again"
-        )
-    if (here := variables.get("eval_setup")) is not None and "device" not in here:
-        return InputError(
-            f"{here['config_path']} cannot be read as the config.yml of a run ({reason(error)})",
-            "choose the one that ns-train wrote",
-        )
-    return None
 
 
 def resuming(checkpoints: Path) -> str:

@@ -9,17 +9,15 @@ from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 
 import pytest
 import torch
 import yaml
 
-from ssa_nerfstudio.errors import InputError, TrainingStopped
-from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, report_in_one_line, resuming
 from ssa_nerfstudio.plugin.methods import METHODS
-from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 
 def called(entry_point: Callable[[], None]) -> None:
@@ -104,6 +102,57 @@ def test_memory_that_runs_out_is_said_in_one_line(refused, run, monkeypatch):
     monkeypatch.setattr("ssa_nerfstudio.plugin.pipeline.SSAPipeline.__init__", fail)
     line = refused("ns-eval", "--load-config", run / "config.yml")
     assert line == "memory ran out (CUDA out of memory); close other programs, or use smaller photos"
+
+
+def test_results_that_are_no_json(refused, run, tmp_path):
+    line = refused("ns-eval", "--load-config", run / "config.yml", "--output-path", tmp_path / "out.txt")
+    assert line == f"--output-path {tmp_path}/out.txt: the results are JSON; choose a name that ends in .json"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [("{}", "it holds a dict"), ("a: [", "while parsing"), (None, ""), ("!!python/name:no.such", "")],
+)
+def test_a_training_of_a_config_that_is_none(content, why, refused, tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = tmp_path / "transforms.json"
+    if content is not None:
+        config.write_text(content)
+    words = ("ssa-splatfacto", "--data", tiny_scene, "--vis", "tensorboard", f"--load-config={config}")
+    line = refused("ns-train", *words)
+    assert line.startswith(f"{config}: No such file" if content is None else f"--load-config {config} cannot be read")
+    assert why in line
+    assert {*tmp_path.iterdir()} <= {config}
+
+
+@pytest.mark.parametrize("content", ["{}", "[]", "{", '{"seconds": 1, "render_height": 4, "render_width": 4}'])
+def test_a_camera_path_that_is_none(content, refused, run, tmp_path, monkeypatch):
+    monkeypatch.setattr("nerfstudio.utils.install_checks.check_ffmpeg_installed", lambda: None)
+    path = tmp_path / "path.json"
+    path.write_text(content)
+    words = ("--camera-path-filename", path, "--output-path", tmp_path / "video.mp4")
+    line = refused("ns-render", "camera-path", "--load-config", run / "config.yml", *words)
+    assert line.startswith(f"--camera-path-filename {path} cannot be read as a camera path")
+    assert line.endswith("; save one in the tab Render of ns-viewer")
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "words", [["pointcloud"], ["pointcloud", "--normal-method", "open3d"], ["poisson"], ["marching-cubes"]]
+)
+def test_what_splats_cannot_be_exported_as(words, refused, run, tmp_path):
+    line = refused("ns-export", *words, "--load-config", run / "config.yml", "--output-dir", tmp_path)
+    assert line.endswith("nor a field to make a mesh of; export the splats: ns-export gaussian-splat")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_box_around_nothing(refused, run, tmp_path):
+    box = [word for name in ("center", "rotation", "scale") for word in (f"--obb-{name}", "0", "0", "0")]
+    words = ("--load-config", run / "config.yml", "--output-dir", tmp_path, *box)
+    line = refused("ns-export", "gaussian-splat", *words)
+    assert line.startswith("no Gaussian lies in the box of --obb-center, --obb-rotation and --obb-scale; choose")
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
@@ -209,51 +258,6 @@ def test_settings_that_upstream_fails_at(settings, says, configure_training, tin
 def test_the_command_that_resumes_has_one_load_dir_and_all_other_options(monkeypatch, options, resumed):
     monkeypatch.setattr(sys, "argv", ["/somewhere/bin/ns-train", "ssa-splatfacto", *options])
     assert resuming(Path("run/models")) == f"ns-train ssa-splatfacto --load-dir run/models {resumed}"
-
-
-@pytest.fixture
-def trainer(tmp_path, monkeypatch):
-    """A trainer of `ns-train` that is at step 25; nothing is set up."""
-    monkeypatch.setattr(sys, "argv", ["ns-train", "ssa-splatfacto", "--data", "photos"])
-    made = SSATrainer.__new__(SSATrainer)
-    made.config = copy.deepcopy(METHODS["ssa-splatfacto"])
-    made.config.timestamp, made.config.experiment_name = "now", "photos"
-    made.checkpoint_dir, made.step, made.training_state = tmp_path, 25, "training"
-    return made
-
-
-def test_ctrl_c_says_from_which_step_the_training_goes_on(trainer, tmp_path):
-    for step in (10, 20):
-        (tmp_path / f"step-{step:09d}.ckpt").touch()
-    with pytest.raises(TrainingStopped) as stopped, trainer._stopped_in_one_line():
-        raise KeyboardInterrupt
-    resumed = f"ns-train ssa-splatfacto --load-dir {tmp_path} --data photos"
-    assert str(stopped.value) == f"at step 25; go on from step 20: {resumed}"
-
-
-def test_ctrl_c_before_the_first_checkpoint(trainer):
-    with pytest.raises(TrainingStopped) as stopped, trainer._stopped_in_one_line():
-        raise KeyboardInterrupt
-    assert str(stopped.value) == "at step 25, before the first checkpoint; start again"
-
-
-def test_ctrl_c_after_the_training_closes_the_viewer(trainer):
-    trainer.training_state = "completed"
-    with trainer._stopped_in_one_line():
-        raise KeyboardInterrupt
-
-
-@pytest.mark.parametrize(("overlay", "why"), [("off", "the overlay was off"), ("auto", "none was detected")])
-def test_the_last_line_says_why_there_is_no_artifact(trainer, overlay, why, capsys):
-    trainer.config.pipeline.model.overlay = overlay
-    trainer.pipeline = SimpleNamespace(model=SimpleNamespace(artifacts=Artifacts()))
-    trainer._report_artifact(25)
-    splats, artifact = capsys.readouterr().out.splitlines()
-    assert (
-        splats
-        == "Splats: ssa export-splats --load-config outputs/photos/ssa-splatfacto/now/config.yml --output-dir splats"
-    )
-    assert artifact == f"Artifact: {why}, no overlay was trained"
 
 
 @pytest.mark.parametrize(
