@@ -11,8 +11,11 @@ import time
 from pathlib import Path
 
 import pytest
+import torch
 from experiments.benchmark.made_results import all_results, folder_of
-from export.small_checkpoints import write_run
+from export.small_checkpoints import one_camera, random_gaussians, write_run
+
+from ssa_nerfstudio.overlay.layer import OracleOverlay
 
 SSA = (sys.executable, "-m", "ssa_nerfstudio")
 ENVIRONMENT = {**os.environ, "OMP_NUM_THREADS": "1"}
@@ -76,6 +79,29 @@ def test_a_full_disk(blocks, tiny_scene, tmp_path):
     assert done.returncode == 2
     assert ("out cannot be written" if blocks else "temporary directory") in in_one_line(done.stderr)
     assert [path.name for path in tmp_path.iterdir()] == ["scene"]
+
+
+@pytest.mark.parametrize(
+    ("words", "names"),
+    [
+        ("export-overlay --load-config run/config.yml --output out --apply scene/images", "out"),
+        ("export-splats --load-config run/config.yml --output-dir out", "out/splat.ply"),
+        ("export-dataset --load-config run/config.yml --data scene --for colmap --output out", "out"),
+        ("simulate --data scene --effects dashboard --output out", "out"),
+    ],
+)
+def test_what_is_exported_to_a_full_disk(words, names, tiny_scene, tmp_path):
+    shutil.copytree(tiny_scene, tmp_path / "scene")
+    transmittance = torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0))
+    artifact = one_camera(OracleOverlay(transmittance, torch.zeros(48, 64, 3)))
+    write_run(tmp_path / "run", artifact, random_gaussians(40))
+    command = f'ulimit -f 1; exec "$0" -m ssa_nerfstudio {words}'
+    done = subprocess.run(["bash", "-c", command, sys.executable], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 2, done.stderr
+    assert f"error: {names} cannot be written (" in done.stderr  # OpenCV's libpng may say so before
+    assert "Traceback" not in done.stderr
+    left = [path for path in tmp_path.rglob("*") if path.relative_to(tmp_path).parts[0] not in ("scene", "run")]
+    assert left == [tmp_path / "out"] * ("/" in names)
 
 
 def test_a_report_on_a_full_disk(tmp_path):
