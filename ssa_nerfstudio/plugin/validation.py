@@ -130,12 +130,12 @@ def check_optimizers(optimizers: Mapping[str, Mapping[str, Any]]) -> None:
         for where in (*_ABOVE_ZERO, *_FROM_ZERO):
             part, name = where.split(".")
             value = getattr(parts.get(part), name, None)
-            if value is None or 0 < value < math.inf or (value == 0 and where in _FROM_ZERO):
+            # A rate of 0 leaves a group as it is; a schedule takes its logarithm.
+            may_be_zero = where in _FROM_ZERO or (where == "optimizer.lr" and parts.get("scheduler") is None)
+            if value is None or 0 < value < math.inf or (value == 0 and may_be_zero):
                 continue
             option = f"--optimizers.{group}.{where}".replace("_", "-")
-            raise InputError(
-                f"{option} must be finite and {'at least' if where in _FROM_ZERO else 'above'} 0, got {value}"
-            )
+            raise InputError(f"{option} must be finite and {'at least' if may_be_zero else 'above'} 0, got {value}")
 
 
 def check_reader(reader: DataParserConfig) -> None:

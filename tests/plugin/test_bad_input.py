@@ -12,8 +12,11 @@ import numpy as np
 import pytest
 import torch
 from conftest import edit_transforms
+from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
+from ssa_nerfstudio.plugin.validation import check_optimizers
 
 
 def refusal(run: Callable) -> str:
@@ -237,3 +240,11 @@ def test_the_command_line_ends_with_the_line_alone_and_exit_code_2(broken_scene,
     assert done.returncode == 2
     assert "train_0004.png cannot be read as a photo" in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_group_without_a_schedule_may_be_frozen():
+    """A schedule takes the rate's logarithm."""
+    frozen = FusedAdamConfig(lr=0.0)
+    check_optimizers({"opacities": {"optimizer": frozen, "scheduler": None}})
+    with pytest.raises(InputError, match="--optimizers.means.optimizer.lr must be finite and above 0, got 0"):
+        check_optimizers({"means": {"optimizer": frozen, "scheduler": ExponentialDecaySchedulerConfig()}})

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import copy
 import threading
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
+import viser
 from nerfstudio.data.scene_box import OrientedBox
 from nerfstudio.viewer.render_state_machine import RenderStateMachine
 from nerfstudio.viewer.utils import parse_object
 from nerfstudio.viewer.viewer_elements import ViewerElement
 
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.viewer import LazyOutputs
+from ssa_nerfstudio.plugin.viewer import LazyOutputs, _SaveButton
 
 
 class Drawing(RenderStateMachine):
@@ -250,6 +253,16 @@ def test_the_saved_picture_is_the_artifact(model):
     rgba = cv2.cvtColor(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED), cv2.COLOR_BGRA2RGBA)
     alpha = model.artifacts.learned()[0].matte().numpy(force=True)
     np.testing.assert_allclose(rgba[..., 3:] / 255, alpha, atol=0.5 / 255 + 1e-6)
+
+
+def test_the_button_sends_the_file_to_who_pressed_it():
+    handle, client = MagicMock(spec=viser.GuiButtonHandle), MagicMock()
+    server = SimpleNamespace(gui=SimpleNamespace(add_button=lambda name, **_: handle))
+    _SaveButton(lambda: ("artifact.png", b"picture")).install(server)
+    (pressed,) = handle.on_click.call_args.args
+    pressed(SimpleNamespace(client=None))
+    pressed(SimpleNamespace(client=client))
+    client.send_file_download.assert_called_once_with("artifact.png", b"picture")
 
 
 def test_the_log_has_scalars_and_pictures_of_the_artifact(pipelines):
