@@ -246,5 +246,5 @@ def test_a_group_without_a_schedule_may_be_frozen():
     """A schedule takes the rate's logarithm."""
     frozen = FusedAdamConfig(lr=0.0)
     check_optimizers({"opacities": {"optimizer": frozen, "scheduler": None}})
-    with pytest.raises(InputError, match="--optimizers.means.optimizer.lr must be finite and above 0, got 0"):
+    with pytest.raises(InputError, match=r"means\.optimizer\.lr must be finite and above 0, got 0"):
         check_optimizers({"means": {"optimizer": frozen, "scheduler": ExponentialDecaySchedulerConfig()}})
