@@ -104,6 +104,22 @@ def test_what_is_exported_to_a_full_disk(words, names, tiny_scene, tmp_path):
     assert left == [tmp_path / "out"] * ("/" in names)
 
 
+def test_a_simulation_that_is_terminated_leaves_no_dataset(tmp_path):
+    """Of its hidden folder, which a process that the system ends cannot remove, nothing is taken for a dataset."""
+    effects = ["watermark", "ui", "dashboard", "rain", "mud", "finger", "vignette", "dust"]
+    words = ["simulate", "--threads", "1", "--output", "out", "--effects", *effects]
+    running = subprocess.Popen(
+        [*SSA, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    while running.poll() is None and not list(tmp_path.iterdir()):
+        time.sleep(0.01)
+    running.terminate()
+    _, err = running.communicate(timeout=60)
+    assert (running.returncode, err) == (-signal.SIGTERM, "")
+    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".out.")] == []
+    assert not list(tmp_path.rglob("transforms.json"))
+
+
 def test_a_report_on_a_full_disk(tmp_path):
     """Of the files of a report, those that are there are whole."""
     runs = [each for each in all_results() if each.run.scene == "attic" and each.run.seed == 0]
