@@ -21,6 +21,7 @@ from ssa_nerfstudio.evidence.detection import Detection
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.plugin import overlay_setup
 from ssa_nerfstudio.plugin import overlay_setup as first_look
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
@@ -223,3 +224,12 @@ def test_resuming_without_an_overlay_cannot_force_one(clean_scene, tmp_path, con
     other.load_dir = path.parent / "nerfstudio_models"
     with pytest.raises(InputError, match=r"--pipeline\.model\.overlay auto"):
         train_and_evaluate(other)
+
+
+def test_the_start_is_told_where_detection_has_found_something(tiny_scene, tmp_path, configure_training, monkeypatch):
+    """What the points miss there starts in a color of its own (`evidence.initialization`)."""
+    told, original = [], overlay_setup.initialize_from
+    monkeypatch.setattr(overlay_setup, "initialize_from", lambda *given: told.append(given[3]) or original(*given))
+    configure_training("ssa-splatfacto", tiny_scene, tmp_path, 1, {}).pipeline.setup(device="cpu")
+    (static,) = told
+    assert static.float().mean() > 0.1
