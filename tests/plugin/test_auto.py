@@ -22,7 +22,6 @@ from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin import overlay_setup
-from ssa_nerfstudio.plugin import overlay_setup as first_look
 from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.trainer import SSATrainer
@@ -97,8 +96,8 @@ def test_resuming_and_reloading_never_look_again(
     def never(*_):
         raise AssertionError("looked again")
 
-    monkeypatch.setattr(first_look, "detect", never)
-    monkeypatch.setattr(first_look, "accumulate", never)
+    monkeypatch.setattr(overlay_setup, "detect", never)
+    monkeypatch.setattr(overlay_setup, "accumulate", never)
     resumed = configure_training("ssa-splatfacto", data, tmp_path, 8, {"num_downscales": 0})
     resumed.load_dir = path.parent / "nerfstudio_models"
     _, second, again = train_and_evaluate(resumed)
@@ -163,13 +162,13 @@ def test_one_line_says_what_was_decided(clean_scene, tiny_scene, tmp_path, capsy
 
 def test_too_few_static_edges_are_called_that(tiny_scene, tmp_path, capsys, monkeypatch, configure_training):
     """A capture has significantly many of them, and what exceeds those of shifted captures is no artifact."""
-    detection = first_look.detect
+    detection = overlay_setup.detect
 
     def few(statistics: ImageStatistics, **_: bool) -> Detection:
         found = detection(statistics)
         return replace(found, verdict="none", coverage=0.0, mask=torch.zeros_like(found.mask))
 
-    monkeypatch.setattr(first_look, "detect", few)
+    monkeypatch.setattr(overlay_setup, "detect", few)
     config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 1)
     config.pipeline.datamanager.dataparser.load_3D_points = False
     config.pipeline.setup(device="cpu")
@@ -185,7 +184,7 @@ def test_soft_artifacts_are_learned_from_a_fiftieth_of_the_frame_on(
     rows, learned, clean_scene, tmp_path, capsys, monkeypatch, configure_training
 ):
     """Detection sees no edges of them; the estimate from points says that they hide two rows of 48, 4.2 %."""
-    estimate = first_look.estimate
+    estimate = overlay_setup.estimate
 
     def soft(*arguments: Any) -> LayerEstimate:
         found = estimate(*arguments)
@@ -195,7 +194,7 @@ def test_soft_artifacts_are_learned_from_a_fiftieth_of_the_frame_on(
         addition, falloff = torch.zeros_like(found.addition), torch.ones_like(found.falloff)
         return replace(found, transmittance=transmittance, addition=addition, falloff=falloff)
 
-    monkeypatch.setattr(first_look, "estimate", soft)
+    monkeypatch.setattr(overlay_setup, "estimate", soft)
     config = configure_training("ssa-splatfacto", clean_scene, tmp_path, 1)
     assert len(config.pipeline.setup(device="cpu").model.artifacts) == learned
     told = " ".join(capsys.readouterr().out.split())
