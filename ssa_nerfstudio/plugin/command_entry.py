@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import shlex
 import sys
 import warnings
@@ -12,7 +11,7 @@ from types import TracebackType
 from ssa_nerfstudio._system.terminal_messages import print_error, refusal, show_warnings
 from ssa_nerfstudio.errors import SSAError, TrainingStopped
 from ssa_nerfstudio.plugin.config_tags import refuse_calls
-from ssa_nerfstudio.plugin.failed_commands import culprit
+from ssa_nerfstudio.plugin.failed_commands import culprit, option_value
 
 
 def report_in_one_line() -> None:
@@ -45,11 +44,8 @@ def check_config() -> None:
     Raises:
         InputError: see `config_tags.refuse_calls`.
     """
-    if is_nerfstudio_command():
-        for option, value in itertools.pairwise([*sys.argv, ""]):
-            name, _, joined = option.partition("=")
-            if name.replace("_", "-") == "--load-config":
-                refuse_calls(Path(joined or value))
+    if is_nerfstudio_command() and (path := option_value("--load-config")):
+        refuse_calls(Path(path))
 
 
 def resuming(checkpoints: Path) -> str:

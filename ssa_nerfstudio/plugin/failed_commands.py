@@ -68,7 +68,7 @@ def _train(here: dict[str, Any], below: list[FrameType], error: Exception) -> In
         return None
     why = f"it holds a {type(config).__name__}" if read else reason(error)
     return InputError(
-        f"--load-config {_value('--load-config')} cannot be read as the config.yml of a run ({why})",
+        f"--load-config {option_value('--load-config')} cannot be read as the config.yml of a run ({why})",
         "choose the one that ns-train wrote",
     )
 
@@ -116,8 +116,8 @@ def _export(here: dict[str, Any], below: list[FrameType], error: Exception) -> I
     )
 
 
-def _value(option: str) -> str:
-    """What this process was called with for an option."""
+def option_value(option: str) -> str:
+    """What this process was called with for an option; empty where it was not."""
     for number, word in enumerate(sys.argv):
         name, equals, value = word.partition("=")
         if name.replace("_", "-") == option:
