@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
-from ssa_nerfstudio._system import terminal_messages
+from ssa_nerfstudio._system import ctrl_c, terminal_messages
 from ssa_nerfstudio._system.environment import check_environment, check_working_directory
 from ssa_nerfstudio.errors import InputError, SSAError
 
@@ -80,7 +80,8 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # names of files may be no text in the terminal's encoding
     try:
-        yield
+        with ctrl_c.unwrapped():
+            yield
         sys.stdout.flush()
     except SSAError as error:
         raise SystemExit(terminal_messages.print_error(error)) from None

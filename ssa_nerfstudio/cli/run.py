@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from ssa_nerfstudio._system import ctrl_c
 from ssa_nerfstudio.cli import arguments
 from ssa_nerfstudio.errors import InputError
 
@@ -115,7 +116,7 @@ class Command:
             record = RunRecord(self.output / RECORD)
             todo = stages(plan)
             try:
-                with terminal_display([stage.name for stage in todo], console) as display:
+                with ctrl_c.unwrapped(), terminal_display([stage.name for stage in todo], console) as display:
                     run_stages(todo, record, display)
             except KeyboardInterrupt as interrupt:
                 raise KeyboardInterrupt(f"stopped; the same command continues in {self.output}") from interrupt

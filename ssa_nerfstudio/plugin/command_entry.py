@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 from types import TracebackType
 
+from ssa_nerfstudio._system.ctrl_c import is_interrupt
 from ssa_nerfstudio._system.terminal_messages import print_error, refusal, show_warnings
 from ssa_nerfstudio.errors import SSAError, TrainingStopped
 from ssa_nerfstudio.plugin.config_tags import refuse_calls
@@ -29,7 +30,7 @@ def report_in_one_line() -> None:
 
     def hook(kind: type[BaseException], error: BaseException, traceback: TracebackType | None) -> None:
         known = refusal(error) or culprit(error, traceback) or error
-        if isinstance(error, KeyboardInterrupt):
+        if is_interrupt(error):
             known = TrainingStopped(f"{Path(sys.argv[0]).name} was stopped before it began")
         if isinstance(known, SSAError):
             raise SystemExit(print_error(known))  # the interpreter takes the exit code from here

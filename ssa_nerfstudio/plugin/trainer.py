@@ -18,6 +18,7 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
+from ssa_nerfstudio._system import ctrl_c
 from ssa_nerfstudio._system.environment import check_environment
 from ssa_nerfstudio.errors import InputError, TrainingError, TrainingStopped
 from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, resuming
@@ -260,7 +261,7 @@ class SSATrainer(Trainer):
         if self.config.max_num_iterations == 0:
             CONSOLE.print(f"The checkpoint is at step {self._start_step} of {planned}: nothing is left to train.")
             return
-        with self._stopped_in_one_line():
+        with self._stopped_in_one_line(), ctrl_c.unwrapped():
             super().train()
 
     @contextmanager
