@@ -257,7 +257,7 @@ def test_the_saved_picture_is_the_artifact(model):
 
 def test_the_button_sends_the_file_to_who_pressed_it():
     handle, client = MagicMock(spec=viser.GuiButtonHandle), MagicMock()
-    server = SimpleNamespace(gui=SimpleNamespace(add_button=lambda name, **_: handle))
+    server: Any = SimpleNamespace(gui=SimpleNamespace(add_button=lambda name, **_: handle))
     _SaveButton(lambda: ("artifact.png", b"picture")).install(server)
     (pressed,) = handle.on_click.call_args.args
     pressed(SimpleNamespace(client=None))
