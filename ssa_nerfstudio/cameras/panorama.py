@@ -136,7 +136,7 @@ def owned_by_neighbors(face: Face, others: Sequence[Face], scale: int = 1) -> li
     Args:
         face: which.
         others: the other faces, of the same size.
-        scale: pixels of a face along the side of one that is meant, as an overlay of lower resolution has them.
+        scale: side of a pixel in the face's own ones; more than 1 for an overlay of lower resolution.
 
     Returns:
         For each owner: numbers of the face's pixels [P], row by row, and positions [P, 2] in the owner's pixels, (0, 0)
@@ -151,10 +151,7 @@ def owned_by_neighbors(face: Face, others: Sequence[Face], scale: int = 1) -> li
     owner, found = np.full(len(directions), -1), np.zeros((len(directions), 2))
     for number, other in enumerate(others):
         positions, depth = other.pixels(directions)
-        inside = (
-            (depth > 0) & (positions >= scale / 2).all(axis=-1) & (positions <= other.size - scale / 2).all(axis=-1)
-        )
-        closer = inside & (depth > nearest)
+        closer = depth > nearest  # within 45 degrees of the other's axis, so inside of its frame
         owner[closer], found[closer], nearest[closer] = number, positions[closer] / scale, depth[closer]
     return [
         (other, beyond[owner == number], found[owner == number])
