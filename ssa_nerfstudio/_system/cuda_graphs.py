@@ -1,7 +1,7 @@
 """Functions of fixed shapes as CUDA graphs: one launch for their values, one for their gradients.
 
-A training step of splats waits for its host, which launches some hundred kernels one by one. It does so unless
-SSA_CUDA_GRAPHS=1; the kernels are the same.
+A training step of splats waits for its host, which launches some hundred kernels one by one. With SSA_CUDA_GRAPHS=0 it
+still does so; the kernels are the same.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ _LOG = logging.getLogger(__name__)
 
 
 def graphs_are_usable() -> bool:
-    """Whether SSA_CUDA_GRAPHS is 1, and there is CUDA."""
-    return os.environ.get("SSA_CUDA_GRAPHS") == "1" and _has_cuda()
+    """Whether there is CUDA, and SSA_CUDA_GRAPHS is not 0."""
+    return os.environ.get("SSA_CUDA_GRAPHS") != "0" and _has_cuda()
 
 
 @cache
@@ -44,7 +44,7 @@ class CapturedPrograms:
 
     def __init__(self) -> None:
         self._pool = torch.cuda.graph_pool_handle()
-        self._stream = torch.cuda.Stream()
+        self._stream = _capture_stream(torch.cuda.current_device())
 
     def __call__(self, program: Program) -> tuple[list[Tensor], Callable[[], object]]:
         """Run a program once, which loads its kernels and libraries, and capture it."""
@@ -78,6 +78,12 @@ class CapturedPrograms:
             current.wait_stream(self._stream)
             if collecting:
                 gc.enable()
+
+
+@cache
+def _capture_stream(device: int) -> torch.cuda.Stream:
+    """One for all captures: libraries hold memory for each stream on which they are used, cuBLAS 32 MiB."""
+    return torch.cuda.Stream(device)
 
 
 class RecordedFunction:

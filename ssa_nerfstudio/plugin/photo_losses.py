@@ -1,4 +1,4 @@
-"""The losses of a training view that depend on its photo or on the overlays; one CUDA graph with SSA_CUDA_GRAPHS=1."""
+"""The losses of a training view that depend on its photo or on the overlays; one CUDA graph on CUDA."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """From splatfacto's parameters to a render.
 
-With SSA_CUDA_GRAPHS=1, the projection is one CUDA graph while training. What is recorded are the activations of the
+On CUDA, the projection is one CUDA graph while training. What is recorded are the activations of the
 parameters and the projection. Spherical harmonics cannot be (`cuda.shade`), nor can sorting and blending: the number of
 tiles that the Gaussians cover differs from view to view. A refinement makes other Gaussians, and with them new
 recordings.
@@ -21,6 +21,9 @@ from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOpt
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 """Of the Gaussians, by the names that splatfacto gives them."""
+MOST_RECORDED = 250_000
+"""Gaussians up to which a projection is recorded: the more there are, the less a step waits for its host, and a
+recording keeps copies of their gradients. Source: docs/results.md, "Large scenes"."""
 
 
 class SplatRenderer:
@@ -48,7 +51,8 @@ class SplatRenderer:
         """
         device = parameters["means"].device
         gsplat = device.type == "cuda" and self._name in ("auto", "gsplat")
-        if gsplat and torch.is_grad_enabled() and options["render_mode"] == "RGB" and graphs_are_usable():
+        few = len(parameters["means"]) <= MOST_RECORDED
+        if gsplat and few and torch.is_grad_enabled() and options["render_mode"] == "RGB" and graphs_are_usable():
             antialiased = options.pop("rasterize_mode") == "antialiased"
             settings = RenderOptions(
                 far_plane=FAR_PLANE, radius_clip=0.0, eps2d=EPS2D, antialiased=antialiased, **options
@@ -89,9 +93,9 @@ def render_recorded(
         projected = projected._replace(depths=projected.depths.detach())
         return gaussians.colors, *(each for each in projected if each is not None)
 
-    kind = cameras.width, cameras.height, *vars(options).values()
+    kind, degree = (cameras.width, cameras.height, *vars(options).values()), options.sh_degree
     views, learned = [cameras.viewmats, cameras.Ks], [parameters[name] for name in PARAMETERS]
-    colors, *rest = calls(compute, views, learned, kind)
+    colors, *rest = calls(compute, views, learned, kind, epoch=degree)  # a training does not go back to one
     means2d, conics, alphas, depths, radii, *directions = rest
     projected = cuda.Projected(means2d, conics, alphas, depths, radii, directions[0] if directions else None)
     image, alpha = cuda.blend(projected, cuda.shade(projected, colors, options), cameras, options)

@@ -7,7 +7,12 @@ import torch
 from recordings import CUDA, recorder, run_again
 from torch import Tensor, nn
 
-from ssa_nerfstudio._system.cuda_graphs import RecordedCalls, RecordedFunction, parameters_replaced
+from ssa_nerfstudio._system.cuda_graphs import (
+    CapturedPrograms,
+    RecordedCalls,
+    RecordedFunction,
+    parameters_replaced,
+)
 
 
 class Mixture:
@@ -155,3 +160,15 @@ def test_a_module_computes_with_other_parameters_where_one_is_shared_and_one_is_
     assert [name for name, _ in module.named_parameters()] == ["0.weight", "1.bias"]
     with pytest.raises(ValueError, match="zip"), parameters_replaced(module, [torch.eye(2)]):
         pass
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_captures_share_the_memory_that_a_library_holds_for_their_stream():
+    matrix = torch.rand(64, 64, device="cuda")
+    held = []
+    for _ in range(8):
+        record = CapturedPrograms()
+        (product,), _ = record(lambda: [matrix @ matrix])
+        del product, record
+        held.append(torch.cuda.memory_allocated())
+    assert held[-1] == held[1]  # cuBLAS takes 32 MiB once
