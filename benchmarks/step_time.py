@@ -3,14 +3,16 @@
 Full resolution, unscaled schedules, the whole body of nerfstudio's training loop, steps 700 to 1099 of one process; the
 device is synchronized at both ends only. Run the methods in turn, several times: a machine drifts more than they
 differ; with --alternate one process trains with CUDA graphs and without by turns. --profile writes where the host's
-time goes.
+time goes. A large scene is made of a small one with --gaussians and --enlarge.
 """
 
 from __future__ import annotations
 
 import copy
+import json
 import os
 import random
+import shutil
 import tempfile
 import time
 from dataclasses import dataclass
@@ -19,10 +21,12 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from gsplat.strategy import ops
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils import writer
+from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.transforms import Transforms
@@ -33,6 +37,8 @@ FIRST, LAST = 699, 1099
 150 ms to load its kernels."""
 TURN = 100
 """Steps of a turn with --alternate, as many as from one refinement to the next."""
+GROWN = 610
+"""Step after which --gaussians splits, and from which on their number stays."""
 PROFILED = (640, 680)
 """Steps between which the profile is taken."""
 
@@ -48,8 +54,13 @@ class Command:
     overlay: Literal["on", "off"] = "on"
     """Whether the method learns an overlay; splatfacto has none."""
 
+    gaussians: int = 0
+    """Split the Gaussians after 610 steps, as densification does, until there are at least so many; then no more."""
+    enlarge: float = 1.0
+    """Enlarge the photos by this: the work of a capture with more pixels, not its details."""
+
     alternate: bool = False
-    """Take eight turns of 100 steps, without CUDA graphs and with (SSA_CUDA_GRAPHS=1), and print a line for both."""
+    """Take eight turns of 100 steps, without CUDA graphs (SSA_CUDA_GRAPHS=0) and with, and print a line for both."""
     profile: Path | None = None
     """Write a table of torch's profiler to this file, and end after the steps that are in it."""
 
@@ -65,7 +76,8 @@ class Command:
         config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
         config.logging.local_writer.enable = False
         config.output_dir = Path(tempfile.mkdtemp())
-        config.data = config.pipeline.datamanager.data = self.data
+        data = self.data if self.enlarge == 1 else _enlarged(self.data, self.enlarge, config.output_dir / "photos")
+        config.data = config.pipeline.datamanager.data = data
         parser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
         config.pipeline.datamanager.dataparser = parser  # pyright: ignore[reportAttributeAccessIssue]
         model = config.pipeline.model
@@ -82,6 +94,8 @@ class Command:
         trainer.setup()
         trainer.config.viewer.quit_on_train_completion = True
         writer.EVENT_WRITERS.clear()  # tensorboard's; splatfacto's default, the viewer, has none
+        if self.gaussians:
+            trainer.callbacks.append(_growth(trainer, self.gaussians))
         if self.profile is not None:
             trainer.config.max_num_iterations = PROFILED[1] + 1
             _write_profile(trainer, self.profile)
@@ -94,6 +108,8 @@ class Command:
             if step in (FIRST, last) or (self.alternate and (step - FIRST) % TURN == 0):
                 if torch.cuda.is_available():
                     torch.cuda.synchronize()
+                    if step == FIRST:
+                        torch.cuda.reset_peak_memory_stats()
                 times[step] = time.perf_counter()
                 if self.alternate:
                     os.environ["SSA_CUDA_GRAPHS"] = str((step - FIRST) // TURN % 2)
@@ -108,7 +124,42 @@ class Command:
             what = f"{self.method} {self.overlay}{graphs and f', CUDA graphs {graphs}'}"
             each = f" ({', '.join(f'{value:.3f}' for value in found)})" if found[1:] else ""
             count = trainer.pipeline.model.num_points
-            print(f"{what}: {sum(found) / len(found):.3f} ms a step{each}, {count} Gaussians")
+            peak = torch.cuda.max_memory_allocated() / 2**20 if torch.cuda.is_available() else 0.0
+            print(f"{what}: {sum(found) / len(found):.3f} ms a step{each}, {count} Gaussians, {peak:.0f} MiB at most")
+
+
+def _enlarged(data: Path, factor: float, folder: Path) -> Path:
+    """Copy a capture's photos and cameras into a folder, so many times as large."""
+    transforms = json.loads((data / "transforms.json").read_text())
+    sizes = {"w", "h"}
+    scaled = sizes | {"fl_x", "fl_y", "cx", "cy"}
+    for camera in (transforms, *transforms["frames"]):
+        camera.update({k: round(factor * v) if k in sizes else factor * v for k, v in camera.items() if k in scaled})
+    for frame in transforms["frames"]:
+        (folder / frame["file_path"]).parent.mkdir(parents=True, exist_ok=True)
+        with Image.open(data / frame["file_path"]) as photo:
+            size = (round(factor * photo.width), round(factor * photo.height))
+            photo.resize(size, Image.Resampling.BICUBIC).save(folder / frame["file_path"])
+    if "ply_file_path" in transforms:
+        shutil.copy(data / transforms["ply_file_path"], folder / transforms["ply_file_path"])
+    (folder / "transforms.json").write_text(json.dumps(transforms))
+    return folder
+
+
+def _growth(trainer: Any, count: int) -> TrainingCallback:
+    """What splits the Gaussians, those with the largest opacity last, and ends their densification."""
+
+    def grow(step: int) -> None:
+        model = trainer.pipeline.model
+        if step != GROWN:
+            return
+        optimizers = {name: trainer.optimizers.optimizers[name] for name in model.gauss_params}
+        while model.num_points < count:
+            rank = model.gauss_params["opacities"].flatten().argsort().argsort()
+            ops.split(model.gauss_params, optimizers, model.strategy_state, rank < count - model.num_points)
+        model.strategy.refine_stop_iter = GROWN
+
+    return TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], grow)
 
 
 def _write_profile(trainer: Any, path: Path) -> None:
