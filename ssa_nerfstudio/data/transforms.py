@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.cameras.lens import Lens
 from ssa_nerfstudio.data.photos import MAX_PIXELS
 from ssa_nerfstudio.errors import InputError
@@ -80,7 +81,9 @@ class Transforms:
         if not path.is_file():
             raise InputError(f"{path} does not exist", "choose a folder that ns-process-data or ssa process made")
         try:
-            meta = json.loads(path.read_text(encoding="utf-8"))
+            meta = json.loads(read_text(path))
+        except InputError:
+            raise
         except OSError as error:
             raise InputError(f"{path} cannot be read ({error.strerror})", "check its permissions") from error
         except (ValueError, RecursionError) as error:

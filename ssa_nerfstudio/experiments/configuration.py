@@ -17,6 +17,7 @@ import yaml
 from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from ssa_nerfstudio._system.text_files import MAX_SETTINGS_BYTES, read_text
 from ssa_nerfstudio.errors import InputError
 
 Kind = Literal["effects", "scenes", "benchmarks", "published"]
@@ -66,7 +67,7 @@ def read(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read, is no YAML, is no mapping, or has a key twice.
     """
     try:
-        values = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
+        values = yaml.load(read_text(path, MAX_SETTINGS_BYTES), Loader=_Loader)
     except (OSError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({error})", "give a YAML file") from error
     except yaml.YAMLError as error:

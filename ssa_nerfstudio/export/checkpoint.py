@@ -12,7 +12,7 @@ import yaml
 from torch import Tensor
 
 from ssa_nerfstudio._system.counted_noun import counted
-from ssa_nerfstudio._system.named_pipes import refuse_pipe
+from ssa_nerfstudio._system.text_files import MAX_SETTINGS_BYTES, read_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts, Overlay
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES
@@ -140,9 +140,10 @@ def data_of_run(config: Path) -> Path:
         InputError: config.yml cannot be read, or the dataset is no longer there.
     """
     try:
-        refuse_pipe(config)
-        manager = yaml.load(config.read_text(encoding="utf-8"), Loader=_Inert)["pipeline"]["datamanager"]
+        manager = yaml.load(read_text(config, MAX_SETTINGS_BYTES), Loader=_Inert)["pipeline"]["datamanager"]
         data = Path(*(manager["data"] or manager["dataparser"]["data"]))
+    except InputError:
+        raise
     except (OSError, yaml.YAMLError, LookupError, TypeError, ValueError, RecursionError) as error:
         raise InputError(
             f"{config} cannot be read ({reason(error)})", "choose the config.yml that ns-train wrote"

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import yaml
 
+from ssa_nerfstudio._system.text_files import MAX_SETTINGS_BYTES, read_text
 from ssa_nerfstudio.errors import InputError
 
 _PREFIX = "tag:yaml.org,2002:python/"
@@ -34,7 +35,7 @@ def refuse_calls(path: Path) -> None:
         InputError: it does.
     """
     try:
-        root = yaml.compose(path.read_text(encoding="utf-8"), Loader=yaml.SafeLoader)
+        root = yaml.compose(read_text(path, MAX_SETTINGS_BYTES), Loader=yaml.SafeLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError):
         return
     for tag in _tags(root):

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from PIL import Image
 
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.cameras.panorama import Face, cut
 from ssa_nerfstudio.data.photos import UPRIGHT, load_photo
 from ssa_nerfstudio.data.sources import Source
@@ -58,7 +59,7 @@ def ingest(source: Source, dataset: Path, frames: int, advance: Callable[[], Non
     """
     record = dataset / f".{source.name}{_RECORD}"
     if record.is_file():
-        cameras = [[Photo(**photo) for photo in each] for each in json.loads(record.read_text(encoding="utf-8"))]
+        cameras = [[Photo(**photo) for photo in each] for each in json.loads(read_text(record))]
         for _ in cameras[0]:
             advance()
         return cameras

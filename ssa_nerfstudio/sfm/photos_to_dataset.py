@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ssa_nerfstudio._system.pycolmap_import import import_pycolmap
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.cameras.panorama import cut
 from ssa_nerfstudio.data.sources import Source
 from ssa_nerfstudio.errors import InputError
@@ -66,7 +67,7 @@ class Summary:
         Raises:
             OSError, ValueError, TypeError, LookupError: it has none that can be read.
         """
-        values = _with_tuples(json.loads((dataset / SUMMARY).read_text(encoding="utf-8")))
+        values = _with_tuples(json.loads(read_text(dataset / SUMMARY)))
         passes = tuple(PassRegistration(**each) for each in values["passes"])
         repair = values["repair"] and Repair(**values["repair"])
         return Summary(**{**values, "passes": passes, "repair": repair})
@@ -183,7 +184,7 @@ def process(
         warn_of_equal_cameras(model, names[:train])
         repair = None
         if known is not None:
-            kept = {*json.loads((motion / KEPT).read_text(encoding="utf-8"))}
+            kept = {*json.loads(read_text(motion / KEPT))}
             now = {image.name for image in model.images.values() if image.has_pose}
             repair = Repair.of(known, photos[:train], masks, kept, now)
         masked = float(np.mean([0.0 if mask is None else 1 - mask.mean() for mask in masks]))

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.capture_detection import detections_to_json, write_detections
 from ssa_nerfstudio.evidence.detection import Detection
@@ -31,7 +32,7 @@ def found_artifacts(folder: Path) -> list[FoundArtifact]:
         InputError: a file of the folder is gone or broken.
     """
     try:
-        groups = json.loads((folder / VERDICTS).read_text(encoding="utf-8"))["groups"]
+        groups = json.loads(read_text(folder / VERDICTS))["groups"]
         found = []
         for group in groups:
             own = folder / group["name"] if len(groups) > 1 else folder

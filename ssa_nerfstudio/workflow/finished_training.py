@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.plugin.artifacts import Artifacts
@@ -62,7 +63,7 @@ class Evaluation:
     @staticmethod
     def read(folder: Path) -> Evaluation:
         """Read what `write` wrote."""
-        values = json.loads((folder / _FILE).read_text(encoding="utf-8"))
+        values = json.loads(read_text(folder / _FILE))
         return Evaluation(**{**values, "pictured": [PicturedGroup(**each) for each in values["pictured"]]})
 
     def write(self, folder: Path) -> None:

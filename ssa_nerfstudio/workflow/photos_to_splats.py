@@ -23,6 +23,7 @@ from PIL import Image
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.data.panorama_entry import Panorama, read_panorama
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.data.writing import staged_file, staged_folder, unwritable_as_input_error
@@ -200,7 +201,7 @@ def warn_of_missed_artifacts(plan: Plan, artifacts: Artifacts) -> None:
 
 
 def _verdicts(plan: Plan) -> dict[str, str]:
-    groups = json.loads((plan.output / DETECTION / VERDICTS).read_text(encoding="utf-8"))["groups"]
+    groups = json.loads(read_text(plan.output / DETECTION / VERDICTS))["groups"]
     return {group["name"]: group["verdict"] for group in groups}
 
 

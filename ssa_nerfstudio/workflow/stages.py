@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
-from ssa_nerfstudio._system.named_pipes import refuse_pipe
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.data.writing import write_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
@@ -107,8 +107,7 @@ class RunRecord:
             self._write()
             return
         try:
-            refuse_pipe(path)
-            for name, entry in json.loads(path.read_text(encoding="utf-8")).items():
+            for name, entry in json.loads(read_text(path)).items():
                 self._choices[name] = dict(entry["choices"])
                 decided = self._decisions[name] = list(entry.get("decisions", []))
                 self._warnings[name] = list(entry.get("warnings", []))
@@ -116,6 +115,8 @@ class RunRecord:
                     sequences = {key: tuple(done.get(key, ())) for key in ("warnings", "files")}
                     known = {**done, **sequences, "decisions": tuple(decided)}
                     self.stages[name] = FinishedStage(name, **known)
+        except InputError:
+            raise
         except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise InputError(f"{path} cannot be read ({error})", "choose another --output") from error
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
@@ -92,9 +93,11 @@ def read(path: Path) -> Result:
     if not path.is_file():
         raise InputError(f"{path} is no file")
     try:
-        values = json.loads(path.read_text(encoding="utf-8"), object_pairs_hook=_current_names)
+        values = json.loads(read_text(path), object_pairs_hook=_current_names)
     except (OSError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path} cannot be read ({error})") from error
+    except InputError:
+        raise
     except ValueError as error:
         raise InputError(f"{path} is no whole JSON ({error}): truncated?") from error
     if not isinstance(values, dict) or values.get("format") != FORMAT:

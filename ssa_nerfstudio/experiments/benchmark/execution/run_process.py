@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.writing import staged_file
 from ssa_nerfstudio.errors import InputError
@@ -70,7 +71,7 @@ class Request:
             InputError: it is not there, or not complete.
         """
         try:
-            return build(cls, json.loads(path.read_text(encoding="utf-8")), str(path))
+            return build(cls, json.loads(read_text(path)), str(path))
         except (OSError, ValueError) as error:
             raise InputError(f"{path} holds no request ({error})") from error
 
@@ -197,7 +198,7 @@ def _artifact(run: Run, pipeline: SSAPipeline, place: ResultsFolder, region: Art
     """Scores of the learned overlays, mean over cameras; empty where none was learned or no truth is known."""
     truth = place.scenes / run.dataset / "layers" / "undistorted.npz"
     learned = pipeline.model.artifacts.learned()
-    if region is not None and run.model.get("overlay") != "off":
+    if region is not None and pipeline.model.config.overlay != "off":
         # What detection took for clean photos has no overlay, that is a matte of 0.
         return region.mattes(learned[0].matte().detach()[..., 0] if learned else None)
     if not learned or not truth.exists():

@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 
 from ssa_nerfstudio._system.counted_noun import counted
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.data.writing import staged_file, unwritable_as_input_error, write_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report import (
@@ -73,7 +74,7 @@ def _plans(folders: list[Path]) -> tuple[set[str], set[str]]:
     for folder in folders:
         for path in sorted((folder / PLANS).glob("bench-*.json")):
             try:
-                values = json.loads(path.read_text(encoding="utf-8"))
+                values = json.loads(read_text(path))
                 runs |= set(values["runs"])
                 protocols.add(values["protocol"])
             except (OSError, ValueError, KeyError, TypeError):
