@@ -1,7 +1,9 @@
-"""One process at a time in a folder."""
+"""One process at a time in a folder, or at a file."""
 
 from __future__ import annotations
 
+import fcntl
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,3 +43,38 @@ def locked_folder(folder: Path, command: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextmanager
+def held(path: Path, wait: bool = False) -> Iterator[bool]:
+    """Lock a file or folder itself, of which nothing is left when the process ends, however it does.
+
+    Args:
+        path: it exists.
+        wait: for another process that holds it.
+
+    Yields:
+        Whether it is locked; the file system may have no locks, and what may not be read cannot be locked.
+
+    Raises:
+        BlockingIOError: another process holds it, or has moved or removed it meanwhile.
+        OSError: it cannot be opened.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except PermissionError:
+        yield False
+        return
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            locked = True
+        except BlockingIOError:
+            raise
+        except OSError:
+            locked = False
+        if not (path.exists() and os.path.samestat(os.fstat(descriptor), path.stat())):
+            raise BlockingIOError(f"{path} was moved by another process")
+        yield locked
+    finally:
+        os.close(descriptor)

@@ -68,6 +68,25 @@ def print_error(error: SSAError) -> int:
     return TRAINING_EXIT_CODE if isinstance(error, TrainingError) else INPUT_EXIT_CODE
 
 
+def print_interrupt(message: str) -> int:
+    """Print what a command that was interrupted says, and return the exit code that it ends with."""
+    _print(message)
+    return INTERRUPTED_EXIT_CODE
+
+
+def replace_closed_streams() -> None:
+    """Open the null device where standard input, output or the error stream is closed.
+
+    The next files would take their numbers, and get what C libraries print.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:  # a closed one's number
+        os.set_inheritable(descriptor, True)
+    os.close(descriptor)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(number, "w", closefd=False))  # noqa: SIM115 - for as long as the process lives
+
+
 def show_warnings() -> None:
     """Print warnings that the library logs, one line each; calling it again changes nothing."""
     logger = logging.getLogger("ssa_nerfstudio")
@@ -81,7 +100,12 @@ class _OneLineHandler(logging.Handler):
 
 
 def _print_line(kind: str, message: str) -> None:
-    line = f"ssa-nerfstudio: {kind}: {' '.join(message.split())}"
+    _print(f"ssa-nerfstudio: {kind}: {' '.join(message.split())}")
+
+
+def _print(line: str) -> None:
+    """Print names as they are, but for what is no text, or would command the terminal."""
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
     if sys.stderr is not None:
         with suppress(OSError):  # full or closed: the exit code still says it
-            print(line.encode("utf-8", "backslashreplace").decode(), file=sys.stderr, flush=True)
+            print(shown, file=sys.stderr, flush=True)

@@ -7,13 +7,12 @@ import io
 import os
 import signal
 import sys
-import threading
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 
-from ssa_nerfstudio._system import ctrl_c, terminal_messages
+from ssa_nerfstudio._system import ctrl_c, terminal_messages, termination
 from ssa_nerfstudio._system.environment import check_environment, check_working_directory
 from ssa_nerfstudio.errors import InputError, SSAError
 
@@ -43,7 +42,7 @@ def main(arguments: list[str] | None = None) -> None:
     """
     arguments = sys.argv[1:] if arguments is None else arguments
     asks_for_help = not arguments or arguments[0] in ("-h", "--help")
-    with _errors_in_one_line("ssa" if asks_for_help else f"ssa {arguments[0]}"):
+    with termination.as_ctrl_c(), _errors_in_one_line("ssa" if asks_for_help else f"ssa {arguments[0]}"):
         if asks_for_help:
             print(_usage(), flush=True)
             raise SystemExit(0 if arguments else 2)
@@ -66,12 +65,13 @@ def run_script(command: type) -> None:
     from ssa_nerfstudio.cli import arguments
 
     program = f"python {sys.argv[0]}"
-    with _errors_in_one_line(program):
+    with termination.as_ctrl_c(), _errors_in_one_line(program):
         arguments.read(command, sys.argv[1:], program, inspect.getdoc(command) or "").run()
 
 
 @contextmanager
 def _errors_in_one_line(program: str) -> Iterator[None]:
+    terminal_messages.replace_closed_streams()
     terminal_messages.show_warnings()
     warnings.simplefilter("ignore", FutureWarning)  # raised by libraries at import; no user can act on them
     warnings.filterwarnings("ignore", ".*The TBB threading layer")  # numba's, about a library of the system
@@ -94,8 +94,7 @@ def _errors_in_one_line(program: str) -> Iterator[None]:
             raise
         raise SystemExit(terminal_messages.print_error(refused)) from None
     except KeyboardInterrupt as interrupt:
-        print(str(interrupt) or f"{program} was stopped", file=sys.stderr)
-        raise SystemExit(terminal_messages.INTERRUPTED_EXIT_CODE) from None
+        raise SystemExit(terminal_messages.print_interrupt(str(interrupt) or f"{program} was stopped")) from None
 
 
 def _run(name: str, options: list[str]) -> None:
@@ -104,7 +103,7 @@ def _run(name: str, options: list[str]) -> None:
     if name not in COMMANDS:
         raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")
     try:
-        with _ended_by_ctrl_c(f"ssa {name}"):
+        with _ended_at_once(f"ssa {name}"):
             from ssa_nerfstudio.cli import arguments
 
             command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
@@ -127,21 +126,16 @@ def _run(name: str, options: list[str]) -> None:
 
 
 @contextmanager
-def _ended_by_ctrl_c(program: str) -> Iterator[None]:
-    """End the process on ctrl+c: nothing has begun, and libraries make other errors of an interrupted import."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def _ended_at_once(program: str) -> Iterator[None]:
+    """End the process where a signal asks for it: nothing has begun, and libraries make other errors of interrupts."""
 
-    def end(_signal: int, _frame: object) -> None:
-        os.write(2, f"{program} was stopped\n".encode())
-        os._exit(terminal_messages.INTERRUPTED_EXIT_CODE)
+    def end(number: int, _frame: object) -> None:
+        with suppress(OSError):
+            os.write(2, f"{program} was stopped\n".encode())
+        os._exit(termination.exit_code(number))
 
-    before = signal.signal(signal.SIGINT, end)
-    try:
+    with termination.handled(end, [signal.SIGINT, *termination.SIGNALS]):
         yield
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _usage() -> str:

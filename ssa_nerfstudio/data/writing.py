@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import errno
+import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from ssa_nerfstudio._system.file_lock import held
 from ssa_nerfstudio.errors import InputError
+
+_PART = ".part"
+_EARLIER = ".earlier"
 
 
 def is_text(name: str) -> bool:
@@ -42,6 +47,8 @@ def unwritable_as_input_error(path: Path) -> Iterator[None]:
 def staged_folder(output: Path, replaces: bool = False) -> Iterator[Path]:
     """Write a folder that appears when the block ends without an error, and not otherwise.
 
+    What a process left of the same folder that was killed is removed first.
+
     Args:
         output: the folder to make. Its parents are made where missing.
         replaces: whether it takes the place of an earlier folder, which goes once the new one is whole.
@@ -56,11 +63,11 @@ def staged_folder(output: Path, replaces: bool = False) -> Iterator[Path]:
         raise _exists_already(output)
     with unwritable_as_input_error(output):
         output.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as scratch:
-            folder = Path(scratch) / output.name
+        with _scratch(output) as scratch:
+            folder = scratch / output.name
             folder.mkdir()
             yield folder
-            earlier = Path(scratch) / f"{output.name}.earlier"
+            earlier = scratch / f"{output.name}{_EARLIER}"
             try:
                 if replaces and output.exists():
                     output.rename(earlier)
@@ -73,6 +80,25 @@ def staged_folder(output: Path, replaces: bool = False) -> Iterator[Path]:
                 raise
 
 
+@contextmanager
+def _scratch(output: Path) -> Iterator[Path]:
+    """A folder beside an output that is locked while it is in use, so that the next process knows it as abandoned."""
+    with ExitStack() as stack:
+        with held(output.parent, wait=True) as alone:  # nobody makes one, and has not locked it yet
+            for left in output.parent.glob(f".{glob.escape(output.name)}.????????{_PART}") if alone else ():
+                _remove_abandoned(left, output.name)
+            made = tempfile.TemporaryDirectory(prefix=f".{output.name}.", suffix=_PART, dir=output.parent)
+            scratch = Path(stack.enter_context(made))
+            stack.enter_context(held(scratch))
+        yield scratch
+
+
+def _remove_abandoned(scratch: Path, name: str) -> None:
+    with suppress(OSError), held(scratch) as abandoned:
+        if abandoned and {path.name for path in scratch.iterdir()} <= {name}:  # else it holds what was to be replaced
+            shutil.rmtree(scratch, ignore_errors=True)
+
+
 def _exists_already(output: Path) -> InputError:
     return InputError(f"{output} exists already", "remove it or choose another output folder")
 
@@ -81,22 +107,33 @@ def _exists_already(output: Path) -> InputError:
 def staged_file(path: Path) -> Iterator[Path]:
     """Write a file that appears, or replaces an older one, when the block ends without an error.
 
-    One process at a time may write a file: two would share the temporary name. It is always the same, so that what a
-    killed process leaves behind is overwritten by the next attempt. It ends in `.part`, so libraries that choose a
-    format by the suffix need the format as an argument.
+    The temporary name is always the same, so that what a killed process leaves behind is overwritten by the next
+    attempt. It ends in `.part`, so libraries that choose a format by the suffix need the format as an argument.
 
     Args:
         path: the file to write; its folder exists.
 
     Yields:
-        The temporary path `.NAME.part` beside it.
+        The temporary path `.NAME.part` beside it, an empty file.
+
+    Raises:
+        InputError: another process is writing the file.
+        OSError: the temporary file cannot be made.
     """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    part = path.with_name(f".{path.name}{_PART}")
+    with ExitStack() as stack:
+        part.touch()
+        try:
+            stack.enter_context(held(part))
+        except BlockingIOError as error:
+            raise InputError(
+                f"another process is writing {path}", "wait until it ends, or choose another place"
+            ) from error
+        try:
+            yield part
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 @contextmanager

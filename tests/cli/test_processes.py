@@ -10,10 +10,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from experiments.benchmark.made_results import all_results, folder_of
 from export.small_checkpoints import one_camera, random_gaussians, write_run
+from PIL import Image
 
 from ssa_nerfstudio.overlay.layer import OracleOverlay
 
@@ -52,8 +54,11 @@ def test_no_output_at_all(tmp_path):
     assert "benchmarks has no 'nothing'" in in_one_line(done.stderr)
 
 
-@pytest.mark.parametrize("seconds", [0.05, 0.15, 0.3, 0.6, 1.2])
-def test_ctrl_c_while_modules_are_imported(seconds, tiny_scene, tmp_path):
+@pytest.mark.parametrize(
+    ("number", "seconds"),
+    [(signal.SIGINT, 0.05), (signal.SIGTERM, 0.1), (signal.SIGINT, 0.3), (signal.SIGTERM, 0.6), (signal.SIGINT, 1.2)],
+)
+def test_a_signal_while_modules_are_imported(number, seconds, tiny_scene, tmp_path):
     """Counted from the command's first line: before it, the interpreter itself starts, for long on a busy machine."""
     program = "import sys; from ssa_nerfstudio.cli import main; print('began', flush=True); main(sys.argv[1:])"
     words = [sys.executable, "-c", program, "detect", "--data", tiny_scene, "--output", tmp_path / "out"]
@@ -61,11 +66,9 @@ def test_ctrl_c_while_modules_are_imported(seconds, tiny_scene, tmp_path):
     assert running.stdout is not None
     assert running.stdout.readline() == "began\n"
     time.sleep(seconds)
-    running.send_signal(signal.SIGINT)
+    running.send_signal(number)
     _, err = running.communicate(timeout=300)
-    assert err == "ssa detect was stopped\n"
-    # Python may end itself by the signal where the import system was interrupted; shells call both 130.
-    assert running.returncode in (130, -signal.SIGINT)
+    assert (running.returncode, err) == (128 + number, "ssa detect was stopped\n")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -104,20 +107,71 @@ def test_what_is_exported_to_a_full_disk(words, names, tiny_scene, tmp_path):
     assert left == [tmp_path / "out"] * ("/" in names)
 
 
-def test_a_simulation_that_is_terminated_leaves_no_dataset(tmp_path):
-    """Of its hidden folder, which a process that the system ends cannot remove, nothing is taken for a dataset."""
+@pytest.mark.parametrize("words", ["--help", "detect --help", "--version"])
+def test_help_that_nobody_can_see(words, tmp_path):
+    command = f'exec "$0" -m ssa_nerfstudio {words} >&-'
+    done = subprocess.run(["bash", "-c", command, sys.executable], cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("streams", [">&-", "<&- >&- 2>&-"])
+def test_a_command_that_can_say_nothing_does_its_work(streams, tiny_scene, tmp_path):
+    command = f'exec "$0" -m ssa_nerfstudio detect --data "$1" --output out {streams}'
+    words = ["bash", "-c", command, sys.executable, tiny_scene]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, env=ENVIRONMENT)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_simulation_that_is_terminated_leaves_nothing(number, tmp_path):
     effects = ["watermark", "ui", "dashboard", "rain", "mud", "finger", "vignette", "dust"]
     words = ["simulate", "--threads", "1", "--output", "out", "--effects", *effects]
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
     running = subprocess.Popen(
-        [*SSA, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=tmp_path
+        [*SSA, *words],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={**ENVIRONMENT, "TMPDIR": str(scratch)},
     )
-    while running.poll() is None and not list(tmp_path.iterdir()):
+    while running.poll() is None and not list(tmp_path.glob(".out.*")):
         time.sleep(0.01)
+    running.send_signal(number)
+    _, err = running.communicate(timeout=60)
+    assert (running.returncode, err) == (128 + number, "ssa simulate was stopped\n")
+    assert list(tmp_path.rglob("*")) == [scratch]
+
+
+def is_colmap_of(parent: subprocess.Popen, process: Path) -> bool:
+    """Whether a folder of /proc is that of a parent's structure from motion."""
+    try:
+        fields = (process / "stat").read_text().rpartition(")")[2].split()
+        return int(fields[1]) == parent.pid and b"ssa_nerfstudio.sfm.colmap" in (process / "cmdline").read_bytes()
+    except OSError:  # it has ended
+        return False
+
+
+def test_structure_from_motion_ends_with_a_command_that_is_terminated(tmp_path):
+    """COLMAP works in a process of its own; what is done is kept for the same command."""
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (8, 300, 400, 3), dtype=np.uint8)
+    for number, photo in enumerate(noise):
+        Image.fromarray(photo).save(photos / f"{number}.png")
+    words = [*SSA, "process", "--train", "photos", "--output", "out", "--threads", "1"]
+    running = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    started = []
+    while running.poll() is None and not started:
+        time.sleep(0.01)
+        started = [path for path in Path("/proc").glob("[0-9]*") if is_colmap_of(running, path)]
     running.terminate()
     _, err = running.communicate(timeout=60)
-    assert (running.returncode, err) == (-signal.SIGTERM, "")
-    assert [path.name for path in tmp_path.iterdir() if not path.name.startswith(".out.")] == []
-    assert not list(tmp_path.rglob("transforms.json"))
+    assert (running.returncode, err) == (143, "stopped; the same command continues from .out.work\n")
+    assert not started[0].exists()
+    assert {path.name for path in tmp_path.iterdir()} == {"photos", ".out.work"}
 
 
 def test_a_report_on_a_full_disk(tmp_path):

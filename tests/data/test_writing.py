@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -78,6 +79,69 @@ def test_what_a_killed_process_left_is_overwritten(tmp_path):
     with staged_file(tmp_path / "file") as part:
         part.write_text("new")
     assert names(tmp_path) == ["file"]
+
+
+KILLED = """
+import os, sys
+from pathlib import Path
+from ssa_nerfstudio.data.writing import staged_folder
+with staged_folder(Path(sys.argv[1])) as folder:
+    (folder / "file").write_text("half")
+    print("at work", flush=True)
+    sys.stdin.read()
+    os._exit(1)
+"""
+
+
+def test_a_folder_that_a_killed_process_left_is_removed_by_the_next_and_not_before(tmp_path):
+    (tmp_path / ".out.notes123").mkdir()
+    (tmp_path / ".out.notes123.part").mkdir()
+    (tmp_path / ".out.notes123.part" / "mine").write_text("of somebody else")
+    kept = names(tmp_path)
+    command = [sys.executable, "-c", KILLED, tmp_path / "out"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as at_work:
+        assert at_work.stdout is not None
+        assert at_work.stdout.readline() == b"at work\n"
+        with staged_folder(tmp_path / "out") as folder:
+            assert len(names(tmp_path)) == len(kept) + 5
+        folder = tmp_path / "out"
+        assert len(names(tmp_path)) == len(kept) + 4
+        folder.rmdir()
+    assert len(names(tmp_path)) == len(kept) + 3
+    with staged_folder(tmp_path / "out"):
+        pass
+    assert names(tmp_path) == sorted([*kept, "out"])
+
+
+def test_an_earlier_folder_that_a_killed_process_was_replacing_is_kept(tmp_path):
+    earlier = tmp_path / ".out.abcdefgh.part" / "out.earlier"
+    earlier.mkdir(parents=True)
+    with staged_folder(tmp_path / "out"):
+        pass
+    assert earlier.is_dir()
+
+
+def test_a_file_that_another_process_is_writing_is_refused(tmp_path):
+    path = tmp_path / "a.ply"
+    with staged_file(path) as part:
+        part.write_text("first")
+        with pytest.raises(InputError, match=r"another process is writing .*a.ply; wait until it ends"):
+            write_text(path, "second")
+    assert path.read_text() == "first"
+    write_text(path, "third")
+    assert (path.read_text(), names(tmp_path)) == ("third", ["a.ply"])
+
+
+def test_where_the_file_system_has_no_locks_files_and_folders_are_written_all_the_same(tmp_path, monkeypatch):
+    def refuse(*_):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    (tmp_path / ".out.abcdefgh.part").mkdir()
+    write_text(tmp_path / "a.json", "{}")
+    with staged_folder(tmp_path / "out"):
+        pass
+    assert names(tmp_path) == [".out.abcdefgh.part", "a.json", "out"]
 
 
 def test_several_files_appear_at_the_end_and_none_after_an_error(tmp_path):
