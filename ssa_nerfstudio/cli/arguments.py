@@ -7,11 +7,13 @@ import os
 import re
 import shutil
 from collections.abc import Sequence
-from contextlib import redirect_stderr
+from contextlib import redirect_stderr, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin
 
 import tyro
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from ssa_nerfstudio.errors import InputError
 
@@ -25,6 +27,44 @@ _NO_HELP = ("For full helptext", "Argument helptext", "Available subcommands")
 
 _NARROWEST = 20
 """Columns of a terminal for which tyro finds a layout; for fewer than 3 it searches for ever."""
+
+_NUMBERS = ConstructorRegistry()
+_KINDS = {int: "whole number", float: "number"}
+
+
+@_NUMBERS.primitive_rule
+def _numbers(option: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    """How tyro reads numbers, or so many, that may be None: its own errors are about unions and Python's types."""
+    members = get_args(option.type) if option.type_origin in (Union, UnionType) else (option.type,)
+    wanted = [member for member in members if member is not NoneType]
+    several = len(wanted) == 1 and get_origin(wanted[0]) is tuple
+    kinds = [*get_args(wanted[0])] if several else wanted
+    if not kinds or kinds[0] not in _KINDS or any(kind is not kinds[0] for kind in kinds) or len(wanted) > 1:
+        return None
+    kind, count, optional = kinds[0], len(kinds), NoneType in members
+    expected = f"{count} {_KINDS[kind]}s" if several else f"a {_KINDS[kind]}"
+
+    def parse(words: list[str]) -> float | tuple[float, ...] | None:
+        if optional and words == ["None"]:
+            return None
+        numbers: list[float] = []
+        with suppress(ValueError):
+            numbers = [kind(word) for word in words]
+        if len(numbers) != count:
+            raise ValueError(f"expected {expected}, got {' '.join(words)!r}")
+        return tuple(numbers) if several else numbers[0]
+
+    def words_of(value: float | tuple[float, ...] | None) -> list[str]:
+        return [str(each) for each in value] if isinstance(value, tuple) else [str(value)]
+
+    def holds(value: object) -> bool:
+        if value is None or isinstance(value, tuple) != several:
+            return optional and value is None
+        return all(isinstance(each, (int, kind)) for each in (value if isinstance(value, tuple) else (value,)))
+
+    names = " ".join([kind.__name__.upper()] * count)
+    metavar = f"{{None}}|{f'{{{names}}}' if several else names}" if optional else names
+    return PrimitiveConstructorSpec("*" if optional and several else count, metavar, parse, holds, words_of)
 
 
 def read(command: type[T], arguments: list[str], program: str, description: str, **defaults: Any) -> T:
@@ -46,7 +86,7 @@ def read(command: type[T], arguments: list[str], program: str, description: str,
     if shutil.get_terminal_size().columns < _NARROWEST:
         os.environ["COLUMNS"] = str(_NARROWEST)
     try:
-        with redirect_stderr(report):
+        with redirect_stderr(report), _NUMBERS:
             made = tyro.cli(command, args=arguments, prog=program, description=description, **defaults)
     except SystemExit as end:
         if not end.code:

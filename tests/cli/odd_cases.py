@@ -25,17 +25,24 @@ class Pipe:
     """A named pipe in place of a file: whoever opens it waits for ever."""
 
 
+class Sparse(int):
+    """So many bytes that are 0 and take no room on the disk."""
+
+
 def bomb(key: str) -> str:
     """YAML of a few lines whose aliases stand for 9^9 values."""
     lists = [f"a{n}: &a{n} [{', '.join(9 * [f'*a{n - 1}' if n else 'x'])}]" for n in range(9)]
     return "\n".join([*lists, f"{key}: *a8"])
 
 
-def write(path: Path, content: str | bytes | Pipe) -> None:
+def write(path: Path, content: str | bytes | Pipe | Sparse) -> None:
     """Make a file, and the folders above it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(content, Pipe):
         os.mkfifo(path)
+    elif isinstance(content, Sparse):
+        path.touch()
+        os.truncate(path, content)
     else:
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
 
@@ -48,6 +55,7 @@ _MADE = {
     "bytes": bytes.fromhex,
     "bomb": bomb,
     "pipe": lambda _: Pipe(),
+    "sparse": Sparse,
 }
 """Values that YAML cannot state, or not briefly, by tag."""
 
@@ -71,7 +79,7 @@ def edit_json(path: Path, case: dict[str, Any]) -> None:
         path.symlink_to(case["link"])
         return
     if (text := case.get("text")) is not None:
-        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        write(path, text)
         return
     content = json.loads(path.read_text())
     if case.get("unsplit"):

@@ -122,7 +122,15 @@ def test_a_value_of_the_wrong_type(name, flag, value, capsys):
         (["detect", "--data", "--json", "x"], "--data"),
         (
             ["detect", "--data=x", "--draws=many"],
-            "Error parsing --draws: invalid literal for int() with base 10: 'many'",
+            "error: Error parsing --draws: expected a whole number, got 'many' (ssa detect --help)",
+        ),
+        (
+            ["simulate", "--output", "x", "--seed", "1.5"],
+            "error: Error parsing --seed: expected a whole number, got '1.5' (ssa simulate --help)",
+        ),
+        (
+            ["simulate", "--output", "x", "--exposure", "much"],
+            "error: Error parsing --exposure: expected a number, got 'much' (ssa simulate --help)",
         ),
         (
             ["detect", "photos"],
@@ -137,7 +145,11 @@ def test_a_value_of_the_wrong_type(name, flag, value, capsys):
         (["process", "--train", "x", "--output", "y", "--no-flatten", "1"], "Unrecognized options: 1"),
         (
             ["export-splats", "--load-config", "x", "--output-dir", "y", "--obb-scale", "1", "2"],
-            "input length 2 did not match expected argument count 3 of `FLOAT FLOAT FLOAT` (ssa export-splats --help)",
+            "error: Error parsing --obb-scale: expected 3 numbers, got '1 2' (ssa export-splats --help)",
+        ),
+        (
+            ["export-splats", "--load-config", "x", "--output-dir", "y", "--obb-center", "1", "2", "up"],
+            "error: Error parsing --obb-center: expected 3 numbers, got '1 2 up' (ssa export-splats --help)",
         ),
     ],
 )
@@ -160,3 +172,5 @@ def test_valid_options_are_taken():
     assert taken == command(Path("x"), "captures", ("a", "b"), list=True)
     taken = arguments.read(command, ["--output=x", "--time_limit", "2", "--no-list"], "ssa bench", "")
     assert taken == command(Path("x"), time_limit=2.0)
+    taken = arguments.read(command, ["--output=x", "--time-limit", "None", "--threads", "2"], "ssa bench", "")
+    assert taken == command(Path("x"), threads=2)
