@@ -1,9 +1,13 @@
-"""Error of the start against the artifact that was simulated: `python benchmarks/start_accuracy.py --data DIR`"""
+"""Error of the start against the artifact that was simulated: `python benchmarks/start_accuracy.py --data DIR`
+
+Of clean datasets it is the error where nothing is in front.
+"""
 
 from __future__ import annotations
 
 import importlib
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -15,7 +19,9 @@ import numpy as np
 import torch
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
+from ssa_nerfstudio import evidence
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
@@ -25,8 +31,25 @@ from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
-CONSTANTS = {
+DETECTION = {
+    "edge_evidence": (
+        "EVIDENCE_THRESHOLDS",
+        "WEAK_EVIDENCE",
+        "MIN_GRADIENT",
+        "MIN_EDGE_SHARES",
+        "DISPLACEMENT_WINDOWS",
+        "MAX_DISPLACED_SHARES",
+        "MIN_STILL_SHARE",
+    ),
+    "null_distribution": ("MAX_SHIFT",),
+    "static_area": ("MAX_OPAQUE_DEVIATION", "MIN_AREA", "MIN_OUTLINE_SHARE"),
+    "detection": ("SIGNIFICANCE", "MIN_OPAQUE_SHARE"),
+}
+"""Constants of the modules in `evidence` that detect, which comes first."""
+ESTIMATE = {
     "point_samples": ("WORKING_SIZE", "OCCLUSION_TOLERANCE", "OCCLUSION_RADIUS"),
+    "falloff": ("SIGNIFICANCE",),
+    "expected_layers": ("DETAIL_RADIUS",),
     "layer_estimate": (
         "ROUNDS",
         "CONJUGATE_GRADIENT_STEPS",
@@ -35,12 +58,13 @@ CONSTANTS = {
         "OUTLIER_SCALE",
         "CLEAR_SHARE",
         "MIN_BRIGHTEST",
-        "DETAIL_RADIUS",
+        "MIN_OPACITY",
+        "CERTAIN_OPACITY",
+        "MIN_ADDED_SHARE",
     ),
     "guided_upsampling": ("RADIUS", "NOISE"),
-    "initialization": ("MIN_OPACITY",),
 }
-"""Of the modules in `evidence`: what stands between photos and start."""
+"""Those of the modules that estimate the layers."""
 
 
 @dataclass
@@ -48,7 +72,7 @@ class Command:
     """Print the errors of T and B where the artifact is and elsewhere; with --vary, for other constants, too."""
 
     data: list[Path] = field(default_factory=list)
-    """Datasets that `ssa simulate` has written."""
+    """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
     """Also halve and double each constant."""
     output: Path | None = None
@@ -58,20 +82,20 @@ class Command:
         """Measure dataset by dataset, and print a table.
 
         Raises:
-            InputError: a dataset has no layers, or none is given.
+            InputError: no dataset is given, or one of them is none.
         """
         if not self.data:
             raise InputError("no dataset is given", "add --data DIR, as ssa simulate writes it")
         for path in self.data:
-            if not (path / "layers/undistorted.npz").is_file():
-                raise InputError(f"{path} has no layers/undistorted.npz", "make it with ssa simulate")
+            Transforms.read(path)
         known = {}
         if self.output is not None and self.output.exists():
             lines = map(json.loads, self.output.read_text(encoding="utf-8").splitlines())
             known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
         variants = [("", 1.0)]
         if self.vary:
-            names = [f"{module}.{name}" for module, names in CONSTANTS.items() for name in names]
+            groups = [*DETECTION.items(), *ESTIMATE.items()]
+            names = [f"{module}.{name}" for module, names in groups for name in names]
             variants += [(name, factor) for name in names for factor in (0.5, 2.0)]
         for path in self.data:
             missing = [variant for variant in variants if (path.name, *variant) not in known]
@@ -97,16 +121,20 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     poses, lenses = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
     views = [View(photo["image"], photo.get("mask"), poses[i], lenses[i]) for i, photo in enumerate(photos)]
     statistics = accumulate((view.image, view.mask) for view in views)
-    opaque, guide = detect(statistics).opaque, guide_of(statistics)
-    with np.load(path / "layers/undistorted.npz") as layers:
-        truth = torch.from_numpy(np.concatenate([layers["T"].mean(axis=-1, keepdims=True), layers["B"]], axis=-1))
+    plain, guide = detect(statistics), guide_of(statistics)
+    truth = torch.cat([torch.ones(*statistics.size, 1), torch.zeros(*statistics.size, 3)], dim=-1)
+    if (path / "layers/undistorted.npz").is_file():
+        with np.load(path / "layers/undistorted.npz") as layers:
+            parts = layers["T"].mean(axis=-1, keepdims=True), layers["B"]
+        truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
     for constant, factor in variants:
         started = time.monotonic()
         with _scaled(constant, factor):
-            found = estimate(sample_points(points, views), guide, opaque)
+            detection = detect(statistics) if constant.split(".")[0] in DETECTION else plain
+            found = estimate(sample_points(points, views), guide, detection.opaque, detection.mask)
             overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
-            initialize_from(overlay, found, guide)
+            initialize_from(overlay, found, guide, detection.mask)
         error = torch.cat(overlay.layers(), dim=-1).detach() - truth
         size = error.abs()
         yield {
@@ -119,6 +147,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "T_off": _mean(size[~covered][:, 0]),
             "B_off": _mean(size[~covered][:, 1:]),
             "adds_light": found.adds_light(),
+            "verdict": detection.verdict,
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),
         }
@@ -130,29 +159,50 @@ def _mean(values: torch.Tensor) -> float:
 
 @contextmanager
 def _scaled(constant: str, factor: float) -> Iterator[None]:
-    """A constant of `evidence`, as MODULE.NAME, times a factor."""
+    """A constant of `evidence`, as MODULE.NAME, times a factor, in all modules that import it."""
     if not constant:
         yield
         return
-    module_name, name = constant.split(".")
-    module = importlib.import_module(f"ssa_nerfstudio.evidence.{module_name}")
-    value = getattr(module, name)
-    setattr(module, name, max(1, round(value * factor)) if isinstance(value, int) else value * factor)
+    module, name = constant.split(".")
+    value = getattr(importlib.import_module(f"{evidence.__name__}.{module}"), name)
+    users = [each for key, each in sys.modules.items() if key.startswith(f"{evidence.__name__}.")]
+    users = [each for each in users if getattr(each, name, None) is value]
+    changed = tuple(_times(each, factor) for each in value) if isinstance(value, tuple) else _times(value, factor)
+    for each in users:
+        setattr(each, name, changed)
     try:
         yield
     finally:
-        setattr(module, name, value)
+        for each in users:
+            setattr(each, name, value)
+
+
+def _times(value: float, factor: float) -> float:
+    """Times the factor; an odd number, as of a window, stays one."""
+    if not isinstance(value, int):
+        return value * factor
+    return 2 * round((value * factor - 1) / 2) + 1 if value % 2 else max(1, round(value * factor))
 
 
 def _print_sensitivity(known: dict[tuple[str, str, float], dict[str, Any]], names: list[str]) -> None:
-    """A row for each constant at half and at twice its value: mean errors where the artifact is, and elsewhere."""
+    """A row for each constant at half and at twice its value: mean errors where artifacts are, and elsewhere; verdicts.
+
+    A changed verdict is one of detection, or whether the artifact adds light.
+    """
 
     def errors(constant: str, factor: float) -> str:
         rows = [known[name, constant, factor] for name in names]
-        on, off = (np.mean([row[f"T_{where}"] + row[f"B_{where}"] for row in rows]) for where in ("on", "off"))
-        return f"{on:.3f} | {off:.3f}"
+        on = np.mean([row["T_on"] + row["B_on"] for row in rows if row["T_on"] + row["B_on"] > 0])
+        off = np.mean([row["T_off"] + row["B_off"] for row in rows])
+        plain = [known[name, "", 1.0] for name in names]
+        changed = sum(
+            any(row[key] != before[key] for key in ("verdict", "adds_light"))
+            for row, before in zip(rows, plain, strict=True)
+        )
+        return f"{on:.3f} | {off:.3f} | {changed}"
 
-    print("\n| constant | half: there | elsewhere | twice: there | elsewhere |\n|---|---|---|---|---|")
+    columns = "there | elsewhere | verdicts changed"
+    print(f"\n| constant | half: {columns} | twice: {columns} |\n|{'---|' * 7}")
     print(f"| all as they are | {errors('', 1.0)} | {errors('', 1.0)} |")
     for constant in dict.fromkeys(constant for _, constant, _ in known if constant):
         print(f"| {constant} | {errors(constant, 0.5)} | {errors(constant, 2.0)} |")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE
 from ssa_nerfstudio.evidence.photo_exposure import DAMPING, MIN_SCALE, OUTLIER_SCALE, ROUNDS, USABLE
-from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 
 SIGNIFICANCE = 0.001
 """Chance that modes of equal variance have as large a share in radial ones, and in r^2: below both is a falloff."""
@@ -80,7 +80,7 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
     usable &= samples.point % (int(usable.sum()) // MAX_SAMPLES + 1) == 0
     if not usable.any():
         return modes.new_zeros(modes.shape[1])
-    point = samples.point[usable].unique(return_inverse=True)[1]
+    known, point = samples.point[usable].unique(return_inverse=True)
     shown_by = torch.nn.functional.one_hot(samples.view[usable] // every)
     columns = torch.cat([modes[samples.pixel[usable]], shown_by.to(modes)], dim=-1)
     values = brightness[usable].clamp_min(_GRAY_LEVEL).log()[:, None]
@@ -89,16 +89,11 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
     damping[: modes.shape[1]] = 1e-9
     weight, solution = torch.ones_like(values), torch.zeros_like(damping)
     for _ in range(ROUNDS):
-        total = _of_points(weight, point)
-        centered = columns - (_of_points(weight * columns, point) / total)[point]
-        rest = values - (_of_points(weight * values, point) / total)[point]
+        total = summed(point, weight, len(known))
+        centered = columns - (summed(point, weight * columns, len(known)) / total)[point]
+        rest = values - (summed(point, weight * values, len(known)) / total)[point]
         weighted = weight * centered
         solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
         rest = rest - centered @ solution
         weight = 1 / (1 + (rest / (OUTLIER_SCALE * (1.48 * rest.abs().median() + MIN_SCALE))).square())
     return solution.flatten()[: modes.shape[1]]
-
-
-def _of_points(values: Tensor, point: Tensor) -> Tensor:
-    """Sum values [S, C] of each point [P, C]."""
-    return values.new_zeros(int(point.max()) + 1, values.shape[1]).index_add_(0, point, values)

@@ -14,9 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.changing_area import changing_area
+from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
-from ssa_nerfstudio.evidence.layer_estimate import DETAIL_RADIUS, MIN_OPACITY, LayerEstimate, estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import CERTAIN_OPACITY, MIN_OPACITY, LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
 from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
@@ -49,7 +50,7 @@ def initialize(overlay: ScreenSpaceOverlay, statistics: ImageStatistics, within:
     overlay.initialize(addition / alpha, alpha, 1 - alpha)
 
 
-def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor) -> LayerEstimate:
+def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tensor) -> LayerEstimate:
     """Estimate an artifact's layers from samples of the scene's points.
 
     Args:
@@ -57,18 +58,18 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor) -> LayerEstim
         guide: see `guide_of`, of the photos that were sampled.
         opaque: [H, W] bool: where static edges enclose something opaque (`Detection.opaque`), which holds where no
             point says otherwise.
+        static: [H, W] bool: where static edges are (`Detection.mask`): clear and opaque are equally likely there.
     """
     reduction = working_reduction(*guide.shape[:2])
     # Photos that vary nowhere show no scene.
-    hidden = (opaque.to(guide.device) | (guide[..., 3] < HALF_GRAY_LEVEL).all()).to(guide)[..., None]
-    photos = torch.cat([guide, hidden * guide[..., :3], 1 - hidden], dim=-1)
-    photos = reduced(photos, reduction).to(samples.color.device)
+    hidden = opaque.to(guide.device) | (guide[..., 3] < HALF_GRAY_LEVEL).all()
+    areas = torch.stack([hidden, static.to(guide.device)], dim=-1).to(guide)
+    photos = reduced(torch.cat([guide, areas], dim=-1), reduction).to(samples.color.device)
     falloff = estimate_falloff(samples)
-    photos[..., :7] /= falloff
-    mean, deviation, addition, transmittance = photos.split((3, 1, 3, 1), dim=-1)
-    if (falloff < 1).any():  # else they are sorted already
+    if (falloff < 1).any():
+        photos[..., :4] /= falloff
         samples = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
-    found = estimate_layers(samples, mean, deviation, torch.cat([transmittance, addition], dim=-1))
+    found = estimate_layers(samples, *photos.split((3, 1, 1, 1), dim=-1))
     return replace(found, falloff=falloff)
 
 
@@ -78,7 +79,8 @@ def initialize_from(
 ) -> None:
     """Initialize an overlay from estimated layers.
 
-    Pixels whose estimated opacity is noise start clear. The sparsity loss weighs a pixel by its transmittance.
+    Pixels whose estimated opacity is noise (`_present`) start clear. The sparsity loss weighs a pixel by its
+    transmittance.
 
     Args:
         overlay: changed in place.
@@ -90,10 +92,8 @@ def initialize_from(
     transmittance, addition = estimate.transmittance, estimate.addition
     if overlay.adds_light:
         transmittance = torch.ones_like(transmittance)
-    opacity = smallest_matte(transmittance, addition)
-    # A pixel wider, for the soft rim.
-    present = nn.functional.max_pool2d((opacity > MIN_OPACITY).float().permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
     reduction = working_reduction(overlay.height, overlay.width)
+    present = _present(smallest_matte(transmittance, addition), static, reduction)
     falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)
     layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition) / falloff, reduction).clamp(0, 1)
     present = enlarged(present, overlay.height, overlay.width, reduction) > 0
@@ -135,6 +135,30 @@ def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor, likely: Tensor | 
 def guide_of(statistics: ImageStatistics) -> Tensor:
     """Mean and deviation of the photos [H, W, 4], float32: where they have edges, an artifact may have some."""
     return torch.cat([statistics.mean(), statistics.deviation()], dim=-1).float()
+
+
+def _present(opacity: Tensor, static: Tensor | None, reduction: int) -> Tensor:
+    """Where the estimated opacity [h, w, 1] is more than noise: 1, elsewhere 0, likewise.
+
+    Opacities below MIN_OPACITY are noise. A connected area of others may be, too: errors of the points' places and
+    colors make a film of what is hard to see. It counts if somewhere in it there is more than CERTAIN_OPACITY, or a
+    static edge.
+
+    Args:
+        opacity: at the working resolution.
+        static: [H, W] bool, of the photos' size; None: nowhere.
+        reduction: photo pixels a working pixel.
+    """
+    count, labels = cv2.connectedComponents((opacity[..., 0] > MIN_OPACITY).cpu().numpy().astype(np.uint8))
+    area = torch.from_numpy(labels).to(opacity.device, torch.int64)[..., None]
+    sure = opacity > CERTAIN_OPACITY
+    if static is not None:
+        sure |= reduced(static.to(opacity)[..., None], reduction) > 0
+    kept = torch.zeros(count, device=opacity.device)
+    kept[area[sure]] = 1
+    kept[0] = 0
+    # A pixel wider, for the soft rim.
+    return nn.functional.max_pool2d(kept[area].permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
 
 
 def _mean_color(layers: Tensor) -> Tensor:

@@ -7,15 +7,14 @@ other by linear regression: the training's own problem, solved on the points alo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
-from ssa_nerfstudio.evidence.point_samples import PointSamples
-from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, calm_areas
+from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 ROUNDS = 8
@@ -31,8 +30,6 @@ CLEAR_SHARE = 0.2
 """Share of the frame that is taken for clear: its transmittance is set to 1, because T C fixes only the product."""
 MIN_BRIGHTEST = 0.3
 """Below this the clearest part of the frame is not clear but hidden, as behind binoculars, and is not rescaled."""
-DETAIL_RADIUS = 4
-"""Working pixels: differences from means over windows of this radius are details, and not the scene's."""
 MIN_OPACITY = 0.1
 """Opacities below this are noise."""
 CERTAIN_OPACITY = 0.3
@@ -85,26 +82,28 @@ class LayerEstimate:
 
 
 @torch.no_grad()
-def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expected: Tensor) -> LayerEstimate:
+def estimate_layers(
+    samples: PointSamples, mean: Tensor, deviation: Tensor, hidden: Tensor, static: Tensor
+) -> LayerEstimate:
     """Estimate T and B of every pixel.
 
     Minimizes, over T, B and the points' colors C, the robust squares of I - T C - B over all samples, with two priors:
     neighboring pixels differ about as much as mean and deviation of the photos do there, and most pixels are as
-    expected (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
+    `expected_layers` says (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
 
     Args:
         samples: of the scene's points.
         mean: of the photos, [h, w, 3] in [0, 1] at the working resolution.
         deviation: of the photos, [h, w, 1], likewise.
-        expected: T and B where no sample says otherwise, [h, w, 4]; (1, 0, 0, 0) is clear.
+        hidden: share of a working pixel that is known to be opaque, [h, w, 1] in [0, 1].
+        static: share of a working pixel where static edges are, likewise.
     """
     height, width = samples.size
     observed, point, pixel = samples.color, samples.point, samples.pixel
     colors = _initial_colors(samples, deviation)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
-    areas = [torch.from_numpy(area).to(pixel.device) for area in calm_areas(deviation[..., 0].cpu().numpy())]
     clear, constant = observed - colors[point], observed - mean.reshape(-1, 3)[pixel]
-    layers = expected = _expected_behind(areas, expected, samples, clear, constant, mean)
+    layers = expected = expected_layers(samples, colors[point], mean, deviation, hidden, static)
     prior = torch.ones_like(layers[..., :1])
     residual = _initial_residual(samples, clear, constant)
     seen_by = torch.bincount(point, minlength=samples.points)[point]
@@ -125,7 +124,7 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
             dim=-1,
         )
         # float64, because colors at a pixel may be equal within rounding, and its block then is all but singular.
-        sums = _sums(pixel, (precision * moments).double(), height * width).reshape(height, width, 9)
+        sums = summed(pixel, (precision * moments).double(), height * width).reshape(height, width, 9)
         if round_ >= ROUNDS // 2:
             prior = 1 / (PRIOR_SCALE**2 + (layers - expected).square().amax(dim=-1, keepdim=True))
         layers = _solve(sums, across, down, prior, expected, layers)
@@ -133,7 +132,7 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
         layers = torch.cat([layers[..., :1] / brightest, layers[..., 1:]], dim=-1).clamp(0, 1)
         transmitted, added = layers.reshape(-1, 4)[pixel].split((1, 3), dim=-1)
         seen = torch.cat([weight * transmitted * (observed - added), weight * transmitted.square()], dim=-1)
-        total = _sums(point, seen, samples.points)
+        total = summed(point, seen, samples.points)
         colors = torch.where(total[:, 3:] > 0.01, total[:, :3] / total[:, 3:].clamp_min(1e-6), colors).clamp(0, 1)
         # Of the color from the other samples: a point seen once says nothing.
         others = (total[:, 3:][point] - seen[:, 3:]).clamp_min(1e-6)
@@ -141,7 +140,7 @@ def estimate_layers(samples: PointSamples, mean: Tensor, deviation: Tensor, expe
         residual = observed - transmitted * colors[point] - added
     outliers = residual.square().mean(dim=-1, keepdim=True) > (OUTLIER_SCALE * scale) ** 2
     counts = torch.cat([outliers.to(residual), torch.ones_like(residual[:, :1])], dim=-1)
-    around = local_mean(_sums(pixel, counts, height * width).reshape(height, width, 2), DETAIL_RADIUS // 2)
+    around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), DETAIL_RADIUS // 2)
     unexplained = around[..., :1] / around[..., 1:].clamp_min(1e-9)
     return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained)
 
@@ -155,51 +154,8 @@ def _initial_residual(samples: PointSamples, clear: Tensor, constant: Tensor) ->
     """
     height, width = samples.size
     excess = (constant.abs() - clear.abs()).sum(dim=-1, keepdim=True)
-    around = local_mean(_sums(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
+    around = local_mean(summed(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
     return torch.where(around.reshape(-1, 1)[samples.pixel] < 0, constant, clear)
-
-
-def _expected_behind(
-    areas: Sequence[Tensor], expected: Tensor, samples: PointSamples, clear: Tensor, constant: Tensor, mean: Tensor
-) -> Tensor:
-    """T and B [h, w, 4] that the sparse prior expects: calm areas whose samples show nothing of the scene are opaque.
-
-    An area is calm because the photos vary there at most MAX_OPAQUE_DEVIATION times as much as elsewhere. An artifact
-    is the reason only if they also vary so little beside what is behind: |I - mean| is T |C - mean C|, so its ratio to
-    |I - C| is about T where T is small, and 1 where what is behind is plain. A pixel's ratio is that of its window,
-    and an area's the mean over its pixels: otherwise many points behind a button would speak for a path beside it.
-
-    Args:
-        areas: flat indices of the pixels of each.
-        expected: elsewhere.
-        samples: of the scene's points.
-        clear: the samples' differences I - C from their points' colors, [S, 3].
-        constant: and I - mean from the mean of the photos.
-        mean: of the photos, [h, w, 3].
-    """
-    height, width = samples.size
-    calm = samples.color.new_zeros(height * width, 1)
-    for area in areas:
-        calm[area] = 1
-    # A gray level, because photos are rounded.
-    values = torch.stack([constant, clear], dim=1).abs().mean(dim=-1) + _GRAY_LEVEL
-    values = values * calm[samples.pixel]
-    around = local_mean(_sums(samples.pixel, values, height * width).reshape(height, width, 2), DETAIL_RADIUS)
-    varying, missing = around.reshape(-1, 2).unbind(dim=-1)
-    ratio = (varying / missing.clamp_min(1e-12)).clamp_max(1)
-    known = missing > 1e-9
-    found = expected.reshape(-1, 4).clone()
-    opaque = nn.functional.pad(mean.reshape(-1, 3), (1, 0))
-    for area in areas:
-        told = ratio[area][known[area]]
-        if len(told) and told.mean() <= MAX_OPAQUE_DEVIATION:
-            found[area] = opaque[area].to(found)
-    return found.reshape(expected.shape)
-
-
-def _sums(index: Tensor, values: Tensor, count: int) -> Tensor:
-    """Sum values [S, C] over equal indices in [0, count): [count, C]."""
-    return values.new_zeros(count, values.shape[1]).index_add_(0, index, values)
 
 
 def _initial_colors(samples: PointSamples, deviation: Tensor) -> Tensor:

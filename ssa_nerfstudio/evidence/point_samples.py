@@ -101,6 +101,11 @@ def regular_subset(points: Tensor, views: int) -> Tensor:
     return points[:: max(1, -(-len(points) * views // MAX_PROJECTIONS))]
 
 
+def summed(index: Tensor, values: Tensor, count: int) -> Tensor:
+    """Sums [count, C] of values [S, C] with equal indices in [0, count)."""
+    return values.new_zeros(count, values.shape[1]).index_add_(0, index, values)
+
+
 def project(
     points: Tensor, world_to_camera: Tensor, intrinsics: Tensor, height: int, width: int
 ) -> tuple[Tensor, Tensor, Tensor]:

@@ -194,7 +194,7 @@ def _learned_overlay(
     if points is not None and (config.overlay == "auto" or by_points):
         device = part.images[0]["image"].device
         samples = sample_points(points.to(device), views_of(part.images, part.cameras, part.gains))
-        found = estimate(samples, guide, detection.opaque) if len(samples.point) else None
+        found = estimate(samples, guide, detection.opaque, detection.mask) if len(samples.point) else None
     if config.overlay == "auto":
         share = 0.0 if found is None else found.share()
         if detection.verdict == "none" and share < MIN_SHARE and not known:

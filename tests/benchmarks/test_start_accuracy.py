@@ -29,6 +29,15 @@ def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_sc
     assert capsys.readouterr().out.count("| layer_estimate.PRIOR_SCALE |") == 2
 
 
-def test_a_capture_without_truth_is_refused(tmp_path):
-    with pytest.raises(InputError, match="undistorted"):
+def test_what_is_not_drawn_on_a_clean_capture_is_an_error(write_built_in_scene, tmp_path, capsys):
+    clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
+    output = tmp_path / "errors.jsonl"
+    Command([clean], output=output).run()
+    row = json.loads(output.read_text())
+    assert row["T_on"] == row["B_on"] == 0
+    assert row["verdict"] in capsys.readouterr().out
+
+
+def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"transforms\.json does not exist"):
         Command([tmp_path]).run()

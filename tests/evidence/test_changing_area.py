@@ -67,8 +67,8 @@ def test_samples_of_what_sways_are_unexplained_and_those_of_what_stands_still_ar
     deviation = torch.full((HEIGHT, WIDTH, 1), 0.15)
     for still in ((slice(24, 36), slice(26, 30)), (slice(4, 14), slice(40, 52))):
         mean[still], deviation[still] = PAINT, 0.01
-    clear = torch.tensor([1.0, 0, 0, 0]).expand(HEIGHT, WIDTH, 4)
-    unexplained = estimate_layers(samples, mean, deviation, clear).unexplained[..., 0]
+    nowhere = torch.zeros(HEIGHT, WIDTH, 1)
+    unexplained = estimate_layers(samples, mean, deviation, nowhere, nowhere).unexplained[..., 0]
     assert unexplained[26:34, 18:24].mean() > 0.3
     assert unexplained[6:12, 42:50].mean() < 0.05
     assert unexplained[5:20, 5:35].mean() < 0.05

@@ -169,6 +169,21 @@ def test_a_part_starts_in_the_color_of_what_was_found_in_it() -> None:
     assert (overlay.color()[2:10, 21:23] > 0.7).all()
 
 
+@pytest.mark.parametrize(("core", "edge", "kept"), [(0.2, False, False), (0.4, False, True), (0.2, True, True)])
+def test_a_weak_film_counts_only_around_what_is_certain(core: float, edge: bool, kept: bool) -> None:
+    """A film of 0.2 beside an artifact that is certain: errors of the points make such films."""
+    layers = estimated(12, 40, 0.1, (0.3, 0.1, 0.1))
+    for part, opacity in ((slice(26, 36), 0.2), (slice(30, 32), core)):
+        layers.transmittance[2:10, part], layers.addition[2:10, part] = 1 - opacity, 0.1 * opacity
+    static = torch.zeros(12, 40, dtype=torch.bool)
+    static[5, 34] = edge
+    overlay = ScreenSpaceOverlay(12, 40)
+    initialize_from(overlay, layers, guide_of(capture(12, 40)[1]), static)
+    matte = overlay.matte()[2:10, 26:36]
+    assert (matte.min() > 0.19) if kept else (matte.max() < 0.011)
+    assert overlay.matte()[:, :20].min() > 0.89
+
+
 def test_additive_light_starts_without_a_matte() -> None:
     _, statistics = capture(12, 16)
     overlay = ScreenSpaceOverlay(12, 16, adds_light=True)

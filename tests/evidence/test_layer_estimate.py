@@ -15,7 +15,7 @@ from ssa_nerfstudio.evidence.point_samples import PointSamples
 HEIGHT, WIDTH = 36, 48
 BRIGHTEST = 0.6
 """Of the scene, so that added light is not clipped."""
-CLEAR = torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(HEIGHT, WIDTH, 4)
+NOWHERE = torch.zeros(HEIGHT, WIDTH, 1)
 
 
 def disc(softness: float = 0.1, radius: float = 0.5) -> Tensor:
@@ -72,7 +72,7 @@ def observe(
 @pytest.mark.parametrize("name", ARTIFACTS)
 def test_layers_come_out_without_an_edge_or_a_decision_of_kind(name: str) -> None:
     transmittance, addition = ARTIFACTS[name]
-    found = estimate_layers(*observe(transmittance, addition), CLEAR)
+    found = estimate_layers(*observe(transmittance, addition), NOWHERE, NOWHERE)
     assert (found.transmittance - transmittance).abs().mean() < 0.04
     assert (found.addition - addition).abs().mean() < 0.03
     assert found.adds_light() == (name == "additive")
@@ -86,7 +86,9 @@ def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, a
     thumb = hidden * disc()
     text = torch.zeros(HEIGHT, WIDTH, 1)
     text[30:33, 2:20:3] = 0.2
-    layers = LayerEstimate(1 - thumb, torch.maximum(text, 0.1 * thumb).expand(-1, -1, 3), CLEAR[..., :1], 0 * thumb)
+    layers = LayerEstimate(
+        1 - thumb, torch.maximum(text, 0.1 * thumb).expand(-1, -1, 3), torch.ones_like(thumb), 0 * thumb
+    )
     assert layers.adds_light() == adds
 
 
@@ -102,7 +104,7 @@ def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> Non
     pixel[stuck] = places[torch.randint(len(places), (int(stuck.sum()),), generator=generator)]
     color[stuck] = addition.reshape(-1, 3)[pixel[stuck]]
     moved = replace(samples, pixel=pixel, color=color)
-    found = estimate_layers(moved, mean, deviation, CLEAR)
+    found = estimate_layers(moved, mean, deviation, NOWHERE, NOWHERE)
     assert (found.transmittance - transmittance)[disc() > 0.99].abs().mean() < 0.1
 
 
@@ -115,7 +117,7 @@ def where(samples: PointSamples, kept: Tensor) -> PointSamples:
 def test_what_hides_most_of_the_frame_softly_is_no_outlier() -> None:
     """An operator below a 360 camera: half of all samples show him, and none of them what is behind."""
     transmittance, addition = film(disc(0.05, radius=0.9), (0.25, 0.2, 0.15))
-    found = estimate_layers(*observe(transmittance, addition, views=14, points=50), CLEAR)
+    found = estimate_layers(*observe(transmittance, addition, views=14, points=50), NOWHERE, NOWHERE)
     assert found.transmittance[transmittance < 0.1].mean() < 0.05
     assert found.transmittance[transmittance > 0.9].mean() > 0.95
 
@@ -125,7 +127,7 @@ def test_a_calm_area_that_hides_the_scene_wherever_points_tell_hides_it_everywhe
     transmittance, addition = film(disc(0.02), (0.25, 0.2, 0.15))
     samples, mean, deviation = observe(transmittance, addition, views=14, points=50)
     core = disc(0.02, radius=0.3) > 0.5
-    found = estimate_layers(where(samples, ~core), mean, deviation, CLEAR)
+    found = estimate_layers(where(samples, ~core), mean, deviation, NOWHERE, NOWHERE)
     assert found.transmittance[core].mean() < 0.05
 
 
@@ -145,21 +147,51 @@ def test_a_film_over_a_plain_part_of_the_scene_is_not_taken_for_opaque() -> None
         point[order], samples.pixel[order], observed[order], 2 * samples.points, samples.size, samples.view[order]
     )
     mean[plain], deviation[plain] = shown, 0.02
-    found = estimate_layers(path, mean, deviation, CLEAR)
+    found = estimate_layers(path, mean, deviation, NOWHERE, NOWHERE)
     assert found.transmittance[plain].min() > 0.6
 
 
 def test_without_samples_the_layers_are_as_expected() -> None:
-    """A pixel that no point was seen at takes what its surroundings say, or else what is expected."""
-    expected = CLEAR.clone()
-    expected[:, :20] = torch.tensor([0.0, 0.3, 0.2, 0.1])
+    """A pixel that no point was seen at takes what its surroundings say, or else what is expected: opaque."""
+    hidden = NOWHERE.clone()
+    hidden[:, :20] = 1
     samples, *_ = observe(*ARTIFACTS["none"])
     part = where(samples, (torch.arange(WIDTH) >= 24).expand(HEIGHT, WIDTH))
     mean = torch.full((HEIGHT, WIDTH, 3), 0.5)
     mean[:, :20] = torch.tensor([0.3, 0.2, 0.1])
-    found = estimate_layers(part, mean, torch.full((HEIGHT, WIDTH, 1), 0.3), expected)
+    found = estimate_layers(part, mean, torch.full((HEIGHT, WIDTH, 1), 0.3), hidden, NOWHERE)
     assert found.transmittance[:, :16].max() < 0.2
     assert found.transmittance[:, 30:].min() > 0.8
+
+
+def strip(samples: PointSamples, every: int) -> PointSamples:
+    """Few of the samples in the lowest rows, all others."""
+    below = samples.pixel // WIDTH >= 28
+    kept = ~below | (torch.arange(len(below)) % every == 0)
+    return replace(samples, **{name: getattr(samples, name)[kept] for name in ("point", "pixel", "color", "view")})
+
+
+@pytest.mark.parametrize("through", [0.0, 0.4, 1.0])
+def test_what_few_samples_show_behind_static_edges_holds_for_all_of_the_part(through: float) -> None:
+    """A bonnet along the bottom that mirrors the scene: no area is calm, and a dozen points are seen behind it.
+
+    Where edges stand still though nothing is there (through = 1), samples say so.
+    """
+    static = NOWHERE.clone()
+    static[28:] = 1
+    color = torch.tensor([0.5, 0.4, 0.35])
+    transmittance = 1 - (1 - through) * static
+    samples, mean, deviation = observe(transmittance, (1 - transmittance) * color, wrong=0.0)
+    mirrored = 0.1 * (torch.rand(samples.color.shape, generator=torch.Generator().manual_seed(5)) - 0.5)
+    seen = samples.color + (1 - transmittance).reshape(-1, 1)[samples.pixel] * mirrored
+    samples = strip(replace(samples, color=seen.clamp(0, 1)).ordered(), every=300)
+    assert 8 <= int((samples.pixel // WIDTH >= 28).sum()) <= 60
+    deviation = deviation.clamp_min(0.1)
+    found = estimate_layers(samples, mean, deviation, NOWHERE, static)
+    assert found.transmittance[30:].mean() == pytest.approx(through, abs=0.2)
+    if through == 0:
+        unknown = estimate_layers(samples, mean, deviation, NOWHERE, NOWHERE)
+        assert unknown.transmittance[30:].mean() > 0.4
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -170,7 +202,7 @@ def test_any_number_of_samples_gives_finite_layers(seed: int) -> None:
         pixel = torch.randint(HEIGHT * WIDTH, (count,), generator=generator)
         samples = PointSamples(point, pixel, torch.rand(count, 3, generator=generator), 5, (HEIGHT, WIDTH), point)
         flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
-        found = estimate_layers(samples, flat, torch.zeros(HEIGHT, WIDTH, 1), CLEAR)
+        found = estimate_layers(samples, flat, NOWHERE, NOWHERE, NOWHERE)
         for layer in (found.transmittance, found.addition):
             assert torch.isfinite(layer).all()
             assert layer.min() >= 0

@@ -224,7 +224,8 @@ def estimated(points: Tensor, images: np.ndarray, masks: list | None = None) -> 
     torn = [None if mask is None else on_device(mask) for mask in masks or [None] * len(images)]
     views = [View(on_device(image), mask, torch.eye(4), K) for image, mask in zip(images, torn, strict=True)]
     statistics = stream(images, masks)
-    found = estimate(sample_points(points, views), guide_of(statistics), torch.zeros(statistics.size, dtype=torch.bool))
+    nowhere = torch.zeros(statistics.size, dtype=torch.bool)
+    found = estimate(sample_points(points, views), guide_of(statistics), nowhere, nowhere)
     for layer in (found.transmittance, found.addition):
         assert torch.isfinite(layer).all()
         assert 0 <= layer.min() <= layer.max() <= 1
