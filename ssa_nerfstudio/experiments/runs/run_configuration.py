@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import difflib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import yaml
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.configuration import build
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
@@ -40,7 +42,7 @@ def configure(
         adapt: changes the method's configuration before `model` is applied.
 
     Raises:
-        InputError: the model has no such setting.
+        InputError: the model has no such setting, or not with such a value.
     """
     config = copy.deepcopy(METHODS[method])
     config.vis = "tensorboard"
@@ -54,11 +56,13 @@ def configure(
     datamanager.train_cameras_sampling_seed += seed
     datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
     adapt(config)
+    kinds: dict[str, Any] = get_type_hints(type(config.pipeline.model), include_extras=True)
     for name, value in (model or {}).items():
         if not hasattr(config.pipeline.model, name):
             close = difflib.get_close_matches(name, vars(config.pipeline.model), n=1)
             raise InputError(f"the model has no setting {name!r}", f"{close[0]!r} may be meant" if close else "")
-        setattr(config.pipeline.model, name, value)
+        built = dataclasses.is_dataclass(value)  # by a caller in Python; files hold keys and values
+        setattr(config.pipeline.model, name, value if built else build(kinds[name], value, f"setting {name!r}"))
     return config
 
 

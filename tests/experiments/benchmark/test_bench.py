@@ -286,6 +286,30 @@ def test_a_misspelt_setting_is_refused_before_anything_runs(tmp_path, capsys):
     assert not (tmp_path / "out" / "scenes").exists()
 
 
+@pytest.mark.parametrize(
+    ("settings", "refused"),
+    [
+        ("sparsity: lg", "setting 'sparsity': Input should be 'l1', 'log' or 'off', got 'lg'"),
+        ("sh_degree: three", "setting 'sh_degree': Input should be a valid integer, got 'three'"),
+        ("method: spotless-mlp, grouping: mpl", "setting 'grouping': Input should be 'mlp' or 'agg', got 'mpl'"),
+        ("method: robustnerf, inlier_quantile: 70", "setting 'inlier_quantile': Input should be less than or equal"),
+        ("method: desplat, distractors: 0", "setting 'distractors': Input should be greater than or equal to 1, got 0"),
+    ],
+)
+def test_a_value_that_a_setting_cannot_have_is_refused_before_anything_runs(tmp_path, capsys, settings, refused):
+    (tmp_path / "odd.yaml").write_text(
+        f"scenes: [{{data: demo}}]\ncandidates: {{odd: {{{settings}}}}}\n"
+        "parts: [{methods: [3dgs, odd], effects: [none], steps: 5}]"
+    )
+    with pytest.raises(SystemExit) as refusal:
+        main(["bench", str(tmp_path / "odd.yaml"), "--output", str(tmp_path / "out")])
+    assert refusal.value.code == 2
+    line = capsys.readouterr().err
+    assert "-odd-" in line
+    assert refused in line
+    assert not (tmp_path / "out" / "scenes").exists()
+
+
 def test_a_run_that_fails_says_why_and_fails_the_command(tmp_path, capsys):
     path = tmp_path / "negative.yaml"
     path.write_text(

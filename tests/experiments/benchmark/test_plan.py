@@ -107,6 +107,19 @@ def test_a_candidate_starts_from_the_row_it_names():
     ]
 
 
+def test_on_and_off_are_words_where_a_setting_has_those():
+    stated = {"overlay": True, "exposure": False, "sparsity": False, "overlay_light": "auto", "guards": False}
+    part = Part(methods=("odd",), effects=("mud",))
+    (run, *_) = plan(benchmark(parts=(part,), candidates={"odd": stated}))
+    assert {name: run.model[name] for name in stated} == {
+        "overlay": "on",
+        "exposure": "off",
+        "sparsity": "off",
+        "overlay_light": "auto",
+        "guards": False,
+    }
+
+
 def test_whatever_changes_the_outcome_changes_the_id():
     run = plan(benchmark())[0]
     others = [

@@ -114,6 +114,14 @@ def test_captures_with_the_artifact_on_their_test_photos_are_judged_by_their_mas
     assert rows["3DGS", "ADC"] == ["19.05", "19.05", "18.05", "16.05", "16.05", "15.05", "", "", ""]
     learned = ["23.55", "23.55", "22.55", "22.55", "22.55", "21.55", "0.750", "0.010", "0.000"]
     assert rows["SSA, default", "ADC"] == learned
+    baseline = Part(("desplat",), ("none",))
+    (masked,) = (result(run) for run in plan(benchmark(scenes=(road,), parts=(baseline,))) if run.real)
+    masked.metrics["outside_psnr"] = 21.0
+    masked.artifact = {"matte_inside": 0.0, "matte_outside": 0.0, "matte_upper_third": 0.0}
+    (alone,) = studies([masked])
+    without = detail_tables.by_mask(alone)
+    assert without is not None
+    assert without.rows[0][-3:] == ["", "", ""]  # it learns no overlay
     report([folder_of(tmp_path, results)], tmp_path / "report")
     text = (tmp_path / "report" / "report.md").read_text()
     assert text.count("By a mask of the artifact") == 1

@@ -14,12 +14,14 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from filelock import FileLock
+from pydantic import Field
 from torch import nn
 from torch.nn import Parameter
 
+from ssa_nerfstudio._system.text_files import read_text
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import category
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
@@ -27,6 +29,11 @@ from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelCo
 from ssa_nerfstudio.plugin.trainer import SSATrainerConfig
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH, MAX_OVERLAY_FACTOR
+
+Count = Annotated[int, Field(ge=1)]
+"""A setting that is a number of something."""
+Share = Annotated[float, Field(ge=0, le=1)]
+"""A setting in [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +57,7 @@ class Capture:
         for path in self.data.iterdir():
             if path.name != "transforms.json":
                 (folder / path.name).symlink_to(path.resolve())
-        meta = json.loads((self.data / "transforms.json").read_text(encoding="utf-8"))
+        meta = json.loads(read_text(self.data / "transforms.json"))
         meta["frames"] = [{**frame, **frames.get(frame["file_path"], {})} for frame in meta["frames"]]
         for split in ("train", "val", "test"):
             if names := meta.get(f"{split}_filenames"):

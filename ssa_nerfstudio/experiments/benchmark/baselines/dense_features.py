@@ -17,6 +17,7 @@ from scipy import sparse
 from torch import Tensor
 
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.benchmark.baselines.diffusion_weights import require
 
 GRID = 50
 """Cells along the longer side of the grid of hand-made features; Stable Diffusion's grid is 50 x 50."""
@@ -83,13 +84,12 @@ def diffusion(folder: Path, photos: Iterable[Tensor], device: torch.device) -> I
 
 
 def _load(folder: Path, device: torch.device) -> Any:
-    try:
-        from diffusers import StableDiffusionPipeline  # pyright: ignore[reportPrivateImportUsage]
-    except ImportError as error:
-        raise InputError("features of Stable Diffusion need diffusers", "pip install '.[diffusion]'") from error
+    require(str(folder), WEIGHTS)
+    from diffusers import StableDiffusionPipeline  # pyright: ignore[reportPrivateImportUsage]
+
     precision = torch.float16 if device.type == "cuda" else torch.float32
     try:
-        loaded = StableDiffusionPipeline.from_pretrained(folder, torch_dtype=precision, local_files_only=True)
+        loaded = StableDiffusionPipeline.from_pretrained(str(folder), torch_dtype=precision, local_files_only=True)
     except (OSError, ValueError, KeyError, TypeError) as error:
         message = f"{folder} holds no Stable Diffusion ({str(error).splitlines()[0]})"
         raise InputError(message, f"download {WEIGHTS}, to that folder") from error

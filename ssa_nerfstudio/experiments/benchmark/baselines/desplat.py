@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel, Count
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata
@@ -52,13 +52,13 @@ class DesplatConfig(SSASplatfactoModelConfig):
     """Configuration of `DesplatModel`."""
 
     _target: type = field(default_factory=lambda: DesplatModel)
-    distractors: int = 1000
+    distractors: Count = 1000
     """Gaussians of each photo."""
     distractor_weight: float = 0.01
     """Weight of mean alpha_D, which keeps them off the scene."""
     emptiness_weight: float = 0.01
     """Weight of mean (1 - alpha_S), which fills the scene behind them."""
-    distractor_refine_epochs: int = 10
+    distractor_refine_epochs: Count = 10
     """Passes over the photos between two moves of transparent Gaussians to where the photo is explained worst."""
 
 

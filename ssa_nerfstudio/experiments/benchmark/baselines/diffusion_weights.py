@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,10 +18,15 @@ def require(weights: str, what: str) -> None:
     """Refuse to begin without weights or without diffusers.
 
     Raises:
-        InputError: `weights` is empty, or diffusers is not installed; in one line, with what to fetch.
+        InputError: `weights` is empty or a folder without a pipeline, or diffusers is not installed; in one line, with
+            what to fetch.
     """
     if not weights:
         raise InputError(f"no weights are stated ({what})", "state a folder that has them, or the id: weights")
+    folder = Path(weights)
+    # A hub's id is a relative path, too, of a folder that is not there.
+    if (folder.is_absolute() or folder.is_dir()) and not (folder / "model_index.json").is_file():
+        raise InputError(f"{weights} holds no weights (no model_index.json)", f"fetch {what}, and state its folder")
     try:
         import diffusers  # noqa: F401
     except ImportError as error:

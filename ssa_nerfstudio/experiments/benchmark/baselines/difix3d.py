@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel, Count
 from ssa_nerfstudio.experiments.benchmark.baselines.diffusion_weights import (
     enough_memory,
     fitted,
@@ -44,7 +44,7 @@ class DifixConfig(SSASplatfactoModelConfig):
     """Folder of the weights of nvidia/difix_ref or nvidia/difix, or that id."""
     reference: bool = True
     """Show the nearest training photo to the model, as nvidia/difix_ref wants; nvidia/difix wants none."""
-    area: int = AREA
+    area: Count = AREA
     """Pixels of the resolution at which renders are enhanced."""
     generator_seed: int = 0
     """Of its noise; the same for every render."""

@@ -17,7 +17,7 @@ from PIL import Image
 
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.writing import staged_file, staged_folder
-from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, Capture
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, Capture, Count
 from ssa_nerfstudio.experiments.benchmark.baselines.diffusion_weights import (
     enough_memory,
     fitted,
@@ -54,13 +54,13 @@ class RestoredConfig(SSASplatfactoModelConfig):
     """Folder of the weights of black-forest-labs/FLUX.1-Kontext-dev, or that id."""
     prompt: str = ""
     """Instruction; empty: the one of PROMPTS for the artifact."""
-    restoration_steps: int = 28
+    restoration_steps: Count = 28
     """Denoising steps for a photo."""
     guidance: float = 2.5
     """Weight of the instruction."""
-    area: int = 1024 * 1024
+    area: Count = 1024 * 1024
     """Pixels of the resolution at which photos are restored."""
-    batch: int = 1
+    batch: Count = 1
     """Photos restored at once."""
     generator_seed: int = 0
     """Of the noise; the same for every photo."""

@@ -15,7 +15,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, BaselineModel, Count, Share
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 
 BINS = 10_000
@@ -66,9 +66,9 @@ class RobustConfig(SSASplatfactoModelConfig):
 
     _target: type = field(default_factory=lambda: RobustModel)
     own_steps: ClassVar[tuple[str, ...]] = ("mask_warmup", "specular_reset_at")
-    inlier_quantile: float = 0.7
+    inlier_quantile: Share = 0.7
     """Share of the residuals that are inliers by themselves."""
-    mask_warmup: int = 500
+    mask_warmup: Count = 500
     """Steps in which the share of all pixels that take part, inliers or not, falls by a factor of e (1.5 / 3e-3)."""
     specular_reset_at: int = 8002
     """Step at which view-dependent color, which explains distractors first, is clamped to SPECULAR_LIMIT; 0: never."""

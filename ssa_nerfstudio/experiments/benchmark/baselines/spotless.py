@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline
-from ssa_nerfstudio.experiments.benchmark.baselines.dense_features import diffusion, hand_made, ward_clusters
+from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Baseline, Count, Share
+from ssa_nerfstudio.experiments.benchmark.baselines.dense_features import WEIGHTS, diffusion, hand_made, ward_clusters
+from ssa_nerfstudio.experiments.benchmark.baselines.diffusion_weights import require
 from ssa_nerfstudio.experiments.benchmark.baselines.robustnerf import BASELINE as ROBUST
 from ssa_nerfstudio.experiments.benchmark.baselines.robustnerf import RobustConfig, RobustModel, inliers
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
@@ -90,11 +91,11 @@ class SpotlessConfig(RobustConfig):
     """How residuals are spread to what looks alike."""
     features: str = "hand-made"
     """hand-made: DAISY and color, no weights; otherwise a folder with the weights of Stable Diffusion 2.1."""
-    least_quantile: float = 0.5
+    least_quantile: Share = 0.5
     """mlp: pixels with residuals below it are inliers."""
-    most_quantile: float = 0.9
+    most_quantile: Share = 0.9
     """mlp: pixels with residuals above it are outliers."""
-    segments: int = 100
+    segments: Count = 100
     """agg: segments of a photo."""
 
 
@@ -146,4 +147,10 @@ class SpotlessModel(RobustModel):
         return network
 
 
-BASELINE = Baseline(SpotlessConfig, ROBUST.settings, learning_rates={"inlier_network": 1e-3})
+def _require_features(settings: dict[str, Any]) -> None:
+    """Refuse features whose weights are not there."""
+    if (features := settings.get("features", "hand-made")) != "hand-made":
+        require(features, WEIGHTS)
+
+
+BASELINE = Baseline(SpotlessConfig, ROBUST.settings, learning_rates={"inlier_network": 1e-3}, check=_require_features)

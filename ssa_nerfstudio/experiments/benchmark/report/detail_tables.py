@@ -47,7 +47,8 @@ def by_mask(study: Study) -> Table | None:
         for method, densification, chosen in study.rows(masked):
             # Without an overlay the clean render is the composite.
             figures = [mean(chosen, m) or mean(chosen, m.removeprefix("composite_")) for m in metrics]
-            mattes = [finite(r.artifact.get(name) for r in chosen) for name in MATTES]
+            # Earlier results of baselines state mattes of 0, though these learn no overlay.
+            mattes = [finite(r.artifact.get(name) for r in chosen if not r.run.baseline) for name in MATTES]
             cells = ["-" if figure is None else f"{figure:.2f}" for figure in figures]
             cells += [f"{statistics.mean(values):.3f}" if values else "" for values in mattes]
             rows.append([*subject, title(method), densification.upper(), *cells])

@@ -14,6 +14,8 @@ from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLE
 
 RUN_KNOBS = ("steps", "image_scale", "densification")
 """What a tradeoff can vary beside settings of the model."""
+SWITCHES = ("overlay", "overlay_light", "overlay_intervals", "exposure", "sparsity")
+"""Settings of the model that can be the word on or off."""
 LATER = ("counterparts", "mask", "clean_tests", "baseline", "exposure")
 """Fields that came later: at their defaults they are no part of an id, so that earlier results keep theirs."""
 
@@ -154,7 +156,7 @@ def _varied(benchmark: Benchmark, scene: SceneEntry, effect: str, seed: int, var
     return dataclasses.replace(
         run,
         seed=seed,
-        model={**run.model, **knobs},
+        model=_in_words({**run.model, **knobs}),
         image_scale=float(scale),
         marks=marks(int(steps), tradeoff.marks),
         variation=dict(variation),
@@ -187,7 +189,6 @@ def _run(benchmark: Benchmark, scene: SceneEntry, effect: str, method: str, dens
     if row.weight_by_category:
         model["sparsity_weight"] = paper_weight(effect, real)
     model |= {name: v for name, v in benchmark.candidates.get(method, {}).items() if name != "method"}
-    model = {name: _switch(value) if name == "overlay" else value for name, value in model.items()}
     return Run(
         scene=scene.title,
         data=scene.data,
@@ -202,7 +203,7 @@ def _run(benchmark: Benchmark, scene: SceneEntry, effect: str, method: str, dens
         steps=steps,
         nerfstudio_method=benchmark.method,
         shipped_overlay=row.shipped_overlay,
-        model=model,
+        model=_in_words(model),
         counterparts="" if real or scene.clean is None else scene.clean,
         mask=scene.mask or "",
         clean_tests=scene.clean_tests,
@@ -211,6 +212,7 @@ def _run(benchmark: Benchmark, scene: SceneEntry, effect: str, method: str, dens
     )
 
 
-def _switch(value: Any) -> Any:
-    """YAML reads on and off as booleans."""
-    return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
+def _in_words(model: dict[str, Any]) -> dict[str, Any]:
+    """Settings with the words on and off where they can have those, which YAML reads as booleans."""
+    words = {True: "on", False: "off"}
+    return {n: words[value] if n in SWITCHES and isinstance(value, bool) else value for n, value in model.items()}

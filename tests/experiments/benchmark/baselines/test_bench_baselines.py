@@ -117,6 +117,30 @@ def test_without_weights_nothing_begins_and_one_line_says_what_to_fetch(tmp_path
     assert not (tmp_path / "results" / "scenes").exists()
 
 
+@pytest.mark.parametrize("made", [True, False])
+@pytest.mark.parametrize(
+    ("setting", "what"),
+    [
+        ("method: difix3d, weights", "nvidia/difix_ref"),
+        ("method: flux-kontext, weights", "FLUX.1-Kontext-dev"),
+        ("method: spotless-mlp, features", "stabilityai/stable-diffusion-2-1"),
+    ],
+)
+def test_a_folder_without_weights_is_refused_before_anything_begins(tmp_path, capsys, setting, what, made):
+    folder = tmp_path / "weights"
+    if made:
+        folder.mkdir()
+    stated = f"candidates:\n  bare: {{{setting}: {folder}}}\n"
+    (tmp_path / "few.yaml").write_text(stated + FILE.format(methods="bare"))
+    with pytest.raises(SystemExit) as refusal:
+        main(["bench", str(tmp_path / "few.yaml"), "--output", str(tmp_path / "results")])
+    assert refusal.value.code == 2
+    line = capsys.readouterr().err
+    assert f"{folder} holds no weights (no model_index.json); fetch " in line
+    assert what in line
+    assert not (tmp_path / "results" / "scenes").exists()
+
+
 @pytest.mark.parametrize("method", ["desplat", "dc-gaussian"])
 def test_exposures_that_a_baseline_would_ignore_are_refused_before_anything_begins(tmp_path, capsys, method):
     (tmp_path / "few.yaml").write_text(FILE.format(methods=method).replace("{num", "{exposure: affine, num"))

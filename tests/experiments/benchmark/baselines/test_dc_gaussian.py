@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+
 import numpy as np
 import pytest
 import torch
@@ -36,6 +39,34 @@ def test_it_finds_the_reflection_of_a_windscreen(capture, tmp_path):
     assert float(pipeline.model.get_loss_dict(*_step(pipeline))["windscreen_opacity"].detach()) == pytest.approx(
         0.01 * float(screen.opacity.detach().clamp_min(0).mean())
     )
+
+
+def test_every_camera_looks_through_its_own_windscreen(capture, tmp_path):
+    folder = shutil.copytree(capture("clean"), tmp_path / "rig")
+    meta = json.loads((folder / "transforms.json").read_text())
+    length = meta.pop("fl_x")
+    for number, frame in enumerate(meta["frames"]):
+        frame["fl_x"] = length * (1.0 + 0.2 * (number % 2))
+    (folder / "transforms.json").write_text(json.dumps(meta))
+    _, pipeline = train("dc-gaussian", folder, tmp_path, 1)
+    model = pipeline.model.train()
+    screens = model._windscreens()  # pyright: ignore
+    for screen, light in zip(screens, (0.1, 0.4), strict=True):
+        screen.opacity.data.fill_(-1.0)
+        screen.reflection.data.fill_(light)
+    cameras = pipeline.datamanager.train_dataset.cameras
+    added = set()
+    for view in range(4):
+        camera = cameras[view : view + 1]
+        camera.metadata = {"cam_idx": view}
+        drawn = model.get_outputs(camera)
+        composite, scene = drawn["composite"], drawn["rgb"]
+        assert composite is not None
+        assert scene is not None
+        light = float((composite - scene).mean().detach())
+        added.add((round(float(camera.fx), 3), round(light, 3)))
+    assert {light for _, light in added} == {0.1, 0.4}
+    assert len(added) == 2  # each focal length has its own
 
 
 @pytest.mark.slow

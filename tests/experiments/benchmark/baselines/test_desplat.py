@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 
 from baselines.training import train
 from ssa_nerfstudio.experiments.benchmark.baselines import desplat
+from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.rasterization import rasterizer
 
 
@@ -17,6 +20,15 @@ def test_a_photos_gaussians_start_before_its_camera():
     assert torch.sigmoid(made["opacities"]).allclose(torch.tensor(desplat.OPACITY))
     nearest = torch.cdist(made["means"], made["means"]).sort(dim=1).values[:, 1:4].mean(dim=1)
     torch.testing.assert_close(made["scales"].exp()[:, 0], nearest, atol=1e-6, rtol=1e-3)
+
+
+@pytest.mark.parametrize(("steps", "factor"), [(30_000, 1.0), (15_000, 2.0), (7000, 4.0), (60_000, 1.0)])
+def test_rates_of_what_belongs_to_single_photos_rise_in_short_trainings(steps, factor):
+    config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    config.max_num_iterations = steps
+    desplat.BASELINE.adapt(config)
+    rates = {name: config.optimizers[f"distractor_{name}"]["optimizer"].lr for name in desplat.RATES}
+    assert rates == pytest.approx({name: factor * rate for name, rate in desplat.RATES.items()})
 
 
 def test_their_gradients_are_those_of_the_plain_rasterizer():

@@ -39,7 +39,7 @@ def flux(tmp_path_factory) -> dict[str, Any]:
     return {"weights": str(weights), "area": 64 * 48, "restoration_steps": 2, "batch": 3}
 
 
-def test_difix_enhances_test_renders_of_any_size_with_the_nearest_photo(capture, difix, tmp_path):
+def test_difix_enhances_test_renders_of_any_size_with_the_nearest_photo(capture, difix, tmp_path, monkeypatch):
     _, pipeline = train("difix3d", capture("clean"), tmp_path, 4, weights=str(difix), area=96 * 64)
     model: Any = pipeline.model
     model.eval()
@@ -48,12 +48,16 @@ def test_difix_enhances_test_renders_of_any_size_with_the_nearest_photo(capture,
     drawn = model.get_outputs(camera)
     assert drawn["rgb"].shape == drawn["rendered"].shape == (48, 64, 3)
     assert not torch.allclose(drawn["rgb"], drawn["rendered"], atol=0.02)
-    assert torch.equal(drawn["rgb"], enhance(model, drawn["rendered"], 5))  # its own photo is the nearest
+    assert torch.equal(drawn["rgb"], enhance(model, drawn["rendered"], 5))
     code = next(module for name, module in sys.modules.items() if name.endswith("pipeline_difix"))
-    assert code.DifixPipeline.asked == ("remove degradation", (88, 64), (88, 64), [199], 0.0)
+    assert code.DifixPipeline.asked == ("remove degradation", (88, 64), (88, 64), 1, [199], 0.0)
+    shown: list[int] = []
+    monkeypatch.setattr(type(model), "enhance", lambda self, render, nearest: shown.append(nearest) or render)
+    model.get_outputs(camera)
+    assert shown == [5]  # its own photo is the nearest
     model.config.reference = False  # as the weights of nvidia/difix want it
     enhance(model, drawn["rendered"], 5)
-    assert code.DifixPipeline.asked == ("remove degradation", (88, 64), None, [199], 0.0)
+    assert code.DifixPipeline.asked == ("remove degradation", (88, 64), None, 1, [199], 0.0)
 
 
 def test_the_reference_looks_where_the_render_does():
@@ -84,6 +88,26 @@ def test_flux_restores_every_training_photo_and_leaves_the_rest(capture, flux, t
     record = json.loads((tmp_path / "restored" / "restoration.json").read_text())
     assert record["prompt"] == "remove the car dashboard occluding the view"
     assert record["seconds"] > 0
+
+
+def test_flux_is_asked_with_the_papers_guidance_and_steps_and_one_seed(capture, flux, tmp_path, monkeypatch):
+    from diffusers.pipelines.flux.pipeline_flux_kontext import FluxKontextPipeline
+
+    plain, asked = FluxKontextPipeline.__call__, []
+
+    def call(self, **arguments):
+        asked.append(arguments)
+        return plain(self, **arguments)
+
+    monkeypatch.setattr(FluxKontextPipeline, "__call__", call)
+    settings = {**flux, "batch": 24, "generator_seed": 3, "prompt": "remove the car"}
+    flux_kontext.write_dataset(Capture(capture("dashboard"), "dashboard", None, settings), tmp_path / "restored")
+    (arguments,) = asked
+    assert (arguments["guidance_scale"], arguments["num_inference_steps"]) == (2.5, 2)
+    assert (arguments["width"], arguments["height"], arguments["max_area"]) == (64, 48, 64 * 48)
+    assert arguments["prompt"] == ["remove the car"] * 24
+    assert [generator.initial_seed() for generator in arguments["generator"]] == [3] * 24
+    assert flux_kontext.RestoredConfig().restoration_steps == 28
 
 
 def test_a_batch_has_photos_of_one_size_alone():

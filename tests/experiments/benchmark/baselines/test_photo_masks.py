@@ -36,6 +36,15 @@ def test_the_true_mask_is_where_the_simulated_artifact_can_be_seen(capture, tmp_
     assert 0.02 < hidden.mean() < 0.5
 
 
+def test_the_true_mask_holds_what_only_adds_light(capture, tmp_path):
+    write_dataset(Capture(capture("rain"), "rain", None, TRUE), tmp_path / "masked")
+    with np.load(capture("rain") / "layers" / "raw.npz") as layers:
+        assert (layers["T"] == 1).all()
+        bright = (layers["B"] > 0.1).any(axis=2)
+    assert bright.any()
+    assert area(tmp_path / "masked")[bright].all()
+
+
 def test_the_true_mask_of_a_real_artifact_is_the_benchmarks(capture, tmp_path):
     Image.fromarray(np.kron(np.eye(2, dtype=np.uint8) * 255, np.ones((24, 32), np.uint8))).save(tmp_path / "mask.png")
     write_dataset(Capture(capture("clean"), "finger", tmp_path / "mask.png", TRUE), tmp_path / "masked")

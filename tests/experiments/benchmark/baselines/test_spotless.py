@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 import torch.nn.functional as F
 
 from baselines.training import train
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.baselines import dense_features, spotless
+from ssa_nerfstudio.experiments.benchmark.baselines import dense_features, robustnerf, spotless
 
 
 def test_the_network_is_one_that_reads_upsampled_features_and_positions():
@@ -96,17 +98,42 @@ def test_stable_diffusion_sees_whole_photos_at_whatever_resolution_training_star
             shapes.append((*photo.shape,))
             yield torch.zeros(3, 5, 5)
 
+    monkeypatch.setattr(spotless, "require", lambda *_: None)
     monkeypatch.setattr(spotless, "hand_made", found)
     monkeypatch.setattr(spotless, "diffusion", lambda folder, photos, device: found(photos))
     train("spotless-mlp", capture("transient"), tmp_path, 1, features=features, num_downscales=1)
     assert shapes == [seen] * 24
 
 
-def test_a_folder_without_weights_is_refused_with_what_to_download(tmp_path):
+def test_weights_that_cannot_be_read_are_refused_with_what_to_download(tmp_path):
     pytest.importorskip("diffusers", reason="pip install '.[diffusion]'")
+    (tmp_path / "model_index.json").write_text("{")
     with pytest.raises(InputError, match="stable-diffusion-2-1, CreativeML") as refusal:
         list(dense_features.diffusion(tmp_path, [torch.rand(8, 8, 3)], torch.device("cpu")))
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("method", ["spotless-mlp", "spotless-agg"])
+def test_the_loss_is_masked_by_the_network_or_the_segments_and_not_by_residuals_alone(capture, tmp_path, method):
+    _, pipeline = train(method, capture("transient"), tmp_path, 3)
+    model: Any = pipeline.model
+    model.train()
+    model.config.stop_split_at = 0  # the histogram stays as it is
+    camera, batch = pipeline.datamanager.next_train(0)
+    outputs = model.get_outputs(camera)
+    residuals = robustnerf.residual(outputs["rgb"], model.target(outputs, batch))
+    bounds = [robustnerf.inliers(residuals, model.residuals.quantile(share)) for share in (0.5, 0.9)]
+    alone = robustnerf.inliers(residuals, model.residuals.quantile(0.7))
+    weights = model.inlier_weights(residuals, batch)
+    assert not torch.equal(weights, alone)
+    if method == "spotless-agg":
+        torch.testing.assert_close(weights, spotless.segment_votes(alone, model._grids[batch["image_idx"]]))
+        return
+    network = model._network()
+    predicted = network(model._grids[batch["image_idx"]], *residuals.shape[:2])
+    torch.testing.assert_close(weights, predicted)
+    expected = spotless.bounds_loss(predicted, *bounds) + 0.5 * network.regularizer()
+    torch.testing.assert_close(model.get_loss_dict(outputs, batch)["inlier_network"], expected)
 
 
 @pytest.mark.slow

@@ -91,7 +91,7 @@ from diffusers import StableDiffusionImg2ImgPipeline
 class DifixPipeline(StableDiffusionImg2ImgPipeline):
     def __call__(self, prompt, image, ref_image=None, *, num_inference_steps, timesteps, guidance_scale, generator):
         shown = ref_image and ref_image.size
-        DifixPipeline.asked = (prompt, image.size, shown, timesteps, guidance_scale)
+        DifixPipeline.asked = (prompt, image.size, shown, num_inference_steps, timesteps, guidance_scale)
         return super().__call__(
             prompt, image, strength=1.0, timesteps=timesteps, guidance_scale=guidance_scale, generator=generator
         )
