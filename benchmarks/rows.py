@@ -1,14 +1,14 @@
 """A row for each capture and artifact: off, paper's rule, default and oracle: `python benchmarks/rows.py RESULTS`
 
 From results of `ssa bench captures`; PSNR in dB, means over seeds. With --methods, a column for each of them, the rows
-that at least one of them has, and the mean over those that all of them have:
+that at least one of them has, and the mean over those that all of them have; below it, what each costs on those:
 `python benchmarks/rows.py RESULTS --methods 3dgs desplat default default/mcmc`.
 """
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,7 @@ import tyro
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.study import MAX_LOSS, Study, lead, mean, studies
-from ssa_nerfstudio.experiments.benchmark.results import read_all
+from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
 
 
 def cells(study: Study, effect: str, scene: str, densification: str) -> list[str]:
@@ -80,6 +80,30 @@ def side_by_side(study: Study, methods: Sequence[str], columns: Sequence[tuple[s
     return "\n".join(lines) if len(lines) > 2 else ""
 
 
+def costs(study: Study, methods: Sequence[str], columns: Sequence[tuple[str, str]]) -> str:
+    """A row for each method, means over the rows that all of them have; empty where there are none.
+
+    FLIP, mean color deviation, peak memory, and seconds of statistics and training in units of the first method's.
+    """
+    cells = [[study.select(*pair, *column) for column in columns] for pair in study.pairs]
+    whole = [row for row in cells if all(mean(chosen, "psnr") is not None for chosen in row)]
+    if not whole:
+        return ""
+
+    def mean_of(figure: Callable[[Result], float], column: int) -> float:
+        finished = ([r for r in row[column] if r.status == "finished"] for row in whole)
+        return statistics.mean(statistics.mean(map(figure, chosen)) for chosen in finished)
+
+    seconds = [mean_of(lambda r: r.seconds["statistics"] + r.seconds["training"], k) for k in range(len(columns))]
+    heads = ("FLIP", "color deviation", "peak MB", f"seconds, {methods[0]} = 1")
+    lines = [f"| mean of {len(whole)} | {' | '.join(heads)} |", f"|{'---|' * (1 + len(heads))}"]
+    for k, method in enumerate(methods):
+        flip, deviation = (mean_of(lambda r, m=m: r.metrics[m], k) for m in ("flip", "mean_color_deviation"))
+        memory = mean_of(lambda r: r.peak_memory_mb, k)
+        lines.append(f"| {method} | {flip:.3f} | {deviation:.1f} | {memory:.0f} | {seconds[k] / seconds[0]:.2f} |")
+    return "\n".join(lines)
+
+
 @dataclass
 class Command:
     """Print a table for each length: a row for each capture and artifact."""
@@ -89,7 +113,7 @@ class Command:
 
     methods: tuple[str, ...] = ()
     """Columns: methods under ADC, or METHOD/mcmc; rows are those that at least one has, the mean is over those that all
-    have. Empty: off, paper's rule, default and oracle under both."""
+    have, as is the table of costs below it. Empty: off, paper's rule, default and oracle under both."""
 
     def run(self) -> None:
         """Print.
@@ -106,6 +130,8 @@ class Command:
             if chosen:
                 if table := side_by_side(study, self.methods, chosen):
                     print(f"\n{study.title}\n\n{table}")
+                    if table := costs(study, self.methods, chosen):
+                        print(f"\n{table}")
                 continue
             columns = ("off", "paper's rule", "default (worst view)", "oracle", "difference")
             heads = [f"{d.upper()}: {column}" for d in study.densifications for column in columns]
