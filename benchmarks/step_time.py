@@ -2,8 +2,8 @@
 
 Full resolution, unscaled schedules, the whole body of nerfstudio's training loop, steps 700 to 1099 of one process; the
 device is synchronized at both ends only. Run the methods in turn, several times: a machine drifts more than they
-differ; with --alternate one process trains with CUDA graphs and without by turns. --profile writes where the host's
-time goes. A large scene is made of a small one with --gaussians and --enlarge.
+differ; with --alternate one process trains without CUDA graphs and with by turns, up to step 1899. --profile writes
+where the host's time goes. A large scene is made of a small one with --gaussians and --enlarge.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ FIRST, LAST = 699, 1099
 150 ms to load its kernels."""
 TURN = 100
 """Steps of a turn with --alternate, as many as from one refinement to the next."""
+GRAPHS = {"off": "0", "on": "1", "with blending": "blending"}
+"""Values of SSA_CUDA_GRAPHS that take turns with --alternate."""
 GROWN = 610
 """Step after which --gaussians splits, and from which on their number stays."""
 PROFILED = (640, 680)
@@ -60,7 +62,8 @@ class Command:
     """Enlarge the photos by this: the work of a capture with more pixels, not its details."""
 
     alternate: bool = False
-    """Take eight turns of 100 steps, without CUDA graphs (SSA_CUDA_GRAPHS=0) and with, and print a line for both."""
+    """Take turns of 100 steps, four without CUDA graphs (SSA_CUDA_GRAPHS=0), four with, and four with that of blending,
+    too (SSA_CUDA_GRAPHS=blending), and print a line for each."""
     profile: Path | None = None
     """Write a table of torch's profiler to this file, and end after the steps that are in it."""
 
@@ -100,7 +103,7 @@ class Command:
             trainer.config.max_num_iterations = PROFILED[1] + 1
             _write_profile(trainer, self.profile)
             return
-        last = FIRST + 8 * TURN if self.alternate else LAST
+        last = FIRST + 4 * len(GRAPHS) * TURN if self.alternate else LAST
         trainer.config.max_num_iterations = last + 1
         times: dict[int, float] = {}
 
@@ -112,13 +115,12 @@ class Command:
                         torch.cuda.reset_peak_memory_stats()
                 times[step] = time.perf_counter()
                 if self.alternate:
-                    os.environ["SSA_CUDA_GRAPHS"] = str((step - FIRST) // TURN % 2)
+                    os.environ["SSA_CUDA_GRAPHS"] = [*GRAPHS.values()][(step - FIRST) // TURN % len(GRAPHS)]
 
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
         trainer.train()
-        for graphs in ("off", "on") if self.alternate else ("",):
-            begin = FIRST + TURN * (graphs == "on")
-            turns = range(begin, last, 2 * TURN) if self.alternate else [FIRST]
+        for number, graphs in enumerate(GRAPHS if self.alternate else [""]):
+            turns = range(FIRST + number * TURN, last, len(GRAPHS) * TURN) if self.alternate else [FIRST]
             length = TURN if self.alternate else last - FIRST
             found = [1e3 * (times[turn + length] - times[turn]) / length for turn in turns]
             what = f"{self.method} {self.overlay}{graphs and f', CUDA graphs {graphs}'}"

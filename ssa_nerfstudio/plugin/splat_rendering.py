@@ -1,15 +1,17 @@
 """From splatfacto's parameters to a render.
 
 On CUDA, the projection is one CUDA graph while training. What is recorded are the activations of the
-parameters and the projection. Spherical harmonics cannot be (`cuda.shade`), nor can sorting and blending: the number of
-tiles that the Gaussians cover differs from view to view. A refinement makes other Gaussians, and with them new
-recordings.
+parameters and the projection. Spherical harmonics cannot be (`cuda.shade`). Sorting and blending are launched one by
+one, because the number of tiles that the Gaussians cover differs from view to view; with SSA_CUDA_GRAPHS=blending they
+are another CUDA graph, in lists with room to spare (`RecordedBlending`). A refinement makes other Gaussians, and with
+them new recordings.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -18,6 +20,9 @@ from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, 
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
 from ssa_nerfstudio.rasterization.constants import EPS2D, FAR_PLANE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, info_of
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.rasterization.recorded_blending import RecordedBlending
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 """Of the Gaussians, by the names that splatfacto gives them."""
@@ -29,9 +34,12 @@ recording keeps copies of their gradients. Source: docs/results.md, "Large scene
 class SplatRenderer:
     """Renders Gaussians of which the parameters are given as they are learned."""
 
-    def __init__(self, name: RasterizerName) -> None:
+    def __init__(self, name: RasterizerName, guarded: bool = True) -> None:
+        """Render with a rasterizer; `guarded`: steps that are not finite are skipped, as `RecordedBlending` wants."""
         self._name: RasterizerName = name
+        self._guarded = guarded
         self.projections = RecordedCalls(CapturedPrograms)
+        self._blending: RecordedBlending | None = None
 
     def __call__(
         self,
@@ -57,10 +65,21 @@ class SplatRenderer:
             settings = RenderOptions(
                 far_plane=FAR_PLANE, radius_clip=0.0, eps2d=EPS2D, antialiased=antialiased, **options
             )
-            return render_recorded(self.projections, parameters, Cameras(viewmats, Ks, width, height, None), settings)
+            cameras = Cameras(viewmats, Ks, width, height, None)
+            return render_recorded(self.projections, self._recorded_blending(), parameters, cameras, settings)
         gaussians = activated(parameters, options["sh_degree"] is not None)
         draw = rasterizer(self._name, device)
         return draw(**gaussians._asdict(), viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
+
+    def _recorded_blending(self) -> RecordedBlending | None:
+        """What blends in one launch; None where kernels are launched one by one."""
+        if not self._guarded or os.environ.get("SSA_CUDA_GRAPHS") != "blending":
+            return None
+        if self._blending is None:
+            from ssa_nerfstudio.rasterization.recorded_blending import RecordedBlending
+
+            self._blending = RecordedBlending()
+        return self._blending
 
 
 def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussians:
@@ -71,12 +90,17 @@ def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussia
 
 
 def render_recorded(
-    calls: RecordedCalls, parameters: Mapping[str, Tensor], cameras: Cameras, options: RenderOptions
+    calls: RecordedCalls,
+    blending: RecordedBlending | None,
+    parameters: Mapping[str, Tensor],
+    cameras: Cameras,
+    options: RenderOptions,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """Render with gsplat's kernels, the projection as a recording.
 
     Args:
         calls: of this training.
+        blending: of this training; None: kernels are launched one by one.
         parameters: of N Gaussians, `PARAMETERS`.
         cameras: without a background.
         options: with `render_mode` RGB.
@@ -98,5 +122,6 @@ def render_recorded(
     colors, *rest = calls(compute, views, learned, kind, epoch=degree)  # a training does not go back to one
     means2d, conics, alphas, depths, radii, *directions = rest
     projected = cuda.Projected(means2d, conics, alphas, depths, radii, directions[0] if directions else None)
-    image, alpha = cuda.blend(projected, cuda.shade(projected, colors, options), cameras, options)
+    blend = blending or cuda.blend
+    image, alpha = blend(projected, cuda.shade(projected, colors, options), cameras, options)
     return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)

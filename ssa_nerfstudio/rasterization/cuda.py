@@ -6,7 +6,6 @@ view matrix with `torch.inverse`, which waits for the device at every frame. A r
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -21,6 +20,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, make_rasterization
+from ssa_nerfstudio.rasterization.tile_lists import TileLists, grid_of
 
 
 class Projected(NamedTuple):
@@ -91,7 +91,7 @@ def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: Ren
     if options.render_mode != "RGB" and backgrounds is not None:
         backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
         backgrounds = backgrounds[:, -channels.shape[-1] :]
-    tiles = math.ceil(width / TILE), math.ceil(height / TILE)
+    tiles = grid_of(width, height)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, *tiles, packed=False, n_cameras=n_cameras)
     offsets = isect_offset_encode(isect_ids, n_cameras, *tiles)
     image, alpha = rasterize_to_pixels(
@@ -110,6 +110,38 @@ def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: Ren
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], dim=-1)
     return image, alpha
+
+
+def blend_lists(
+    means2d: Tensor,
+    conics: Tensor,
+    channels: Tensor,
+    alphas: Tensor,
+    cameras: Cameras,
+    lists: TileLists,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor]:
+    """Blend one camera's Gaussians as `blend` does, by lists of a given length, all on the current stream.
+
+    Args:
+        means2d, conics, channels, alphas: of `Projected` and `shade`, [1, N, ...].
+        cameras: one, without a background.
+        lists: of its tiles.
+        absgrad: as in `RenderOptions`.
+    """
+    return rasterize_to_pixels(
+        means2d,
+        conics,
+        channels,
+        alphas,
+        cameras.width,
+        cameras.height,
+        TILE,
+        lists.offsets,
+        lists.gaussians,
+        masks=lists.drawn,
+        absgrad=absgrad,
+    )
 
 
 def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:

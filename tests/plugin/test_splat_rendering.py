@@ -1,4 +1,4 @@
-"""A training view that is rendered with a recorded projection against one that launches every kernel by itself."""
+"""A training view that is rendered by recordings against one that launches every kernel by itself."""
 
 from __future__ import annotations
 
@@ -71,13 +71,14 @@ def outcome(renderer: SplatRenderer, given: Mapping[str, Tensor], view: int, sh_
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="gsplat needs CUDA")
 @pytest.mark.parametrize(("sh_degree", "mode"), [(3, "classic"), (0, "antialiased"), (None, "classic")])
-def test_a_recorded_projection_draws_the_same_with_the_same_gradients(monkeypatch, sh_degree, mode):
+@pytest.mark.parametrize("graphs", ["1", "blending"])
+def test_recordings_draw_the_same_with_the_same_gradients(monkeypatch, sh_degree, mode, graphs):
     given = parameters(500, "cuda")
     renderer = SplatRenderer("auto")
     for view in range(8):
         found = []
-        for graphs in ("0", "1"):
-            monkeypatch.setenv("SSA_CUDA_GRAPHS", graphs)
+        for launched in ("0", graphs):
+            monkeypatch.setenv("SSA_CUDA_GRAPHS", launched)
             found.append(outcome(renderer, given, view, sh_degree, mode)[0])
         assert found[0].keys() == found[1].keys()
         for name, expected in found[0].items():
@@ -119,7 +120,9 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
         for plain in (True, False):
             for value in given.values():
                 value.grad = None
-            image, alpha, info = render_recorded(RecordedCalls(run_again) if plain else calls, given, seen, options)
+            image, alpha, info = render_recorded(
+                RecordedCalls(run_again) if plain else calls, None, given, seen, options
+            )
             (image[0, 0, 0] * torch.tensor([1.0, 2.0, 3.0])).sum().add(alpha[0, 0, 0, 0]).backward()
             gradients = {name: value.grad.clone() for name, value in given.items() if value.grad is not None}
             found.append({"image": image.detach().clone(), "radii": info["radii"].clone(), **gradients})

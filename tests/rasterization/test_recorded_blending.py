@@ -1,0 +1,164 @@
+"""Recorded blending against plain blending: on a CPU with gsplat's kernels replaced by torch, on CUDA with them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from recordings import CUDA, recorder
+from torch import Tensor
+
+from ssa_nerfstudio.rasterization import cuda, reference
+from ssa_nerfstudio.rasterization.interface import Cameras, RenderOptions
+from ssa_nerfstudio.rasterization.projection import Splats
+from ssa_nerfstudio.rasterization.recorded_blending import LOOK_EVERY, ROOM, TIGHT, RecordedBlending
+from ssa_nerfstudio.rasterization.tile_lists import entries_of
+
+WIDTH, HEIGHT = 50, 40
+NAMES = ("means2d", "conics", "alphas", "channels")
+
+
+def blended_by_torch(
+    means2d: Tensor,
+    conics: Tensor,
+    colors: Tensor,
+    alphas: Tensor,
+    width: int,
+    height: int,
+    tile: int,
+    offsets: Tensor,
+    ids: Tensor,
+    masks: Tensor,
+    absgrad: bool,
+) -> tuple[Tensor, Tensor]:
+    """What gsplat's kernels draw, and, in place of the sums of magnitudes, three times the gradients."""
+    image, alpha = means2d.new_zeros(height, width, 3), means2d.new_zeros(height, width, 1)
+    starts = [*offsets.flatten().tolist(), len(ids)]
+    splats = Splats(ids, ids, means2d[0], conics[0], alphas[0], colors[0])
+    for i in range(offsets.numel()):
+        row, column = divmod(i, offsets.shape[2])
+        if masks.flatten()[i]:
+            edges = row * tile, min(row * tile + tile, height), column * tile, min(column * tile + tile, width)
+            here = ids[starts[i] : starts[i + 1]].long()
+            color, opaque = reference._blend_tile(splats, means2d[0], here, *edges)
+            image[edges[0] : edges[1], edges[2] : edges[3]] = color
+            alpha[edges[0] : edges[1], edges[2] : edges[3]] = opaque
+    if absgrad:
+        means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", 3 * gradient))
+    return image[None], alpha[None]
+
+
+@pytest.fixture(autouse=True)
+def kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not torch.cuda.is_available():
+        monkeypatch.setattr(cuda, "rasterize_to_pixels", blended_by_torch)
+
+
+def view(count: int, seed: int, device: str, size: float = 4.0) -> dict[str, Tensor]:
+    """Splats of a view, of which the last one is not drawn."""
+    generator = torch.Generator().manual_seed(seed)
+    made = {
+        "means2d": torch.rand(1, count, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT]),
+        "conics": torch.tensor([1.0, 0.3, 0.8]).expand(1, count, 3) / size**2,
+        "alphas": 0.2 + 0.7 * torch.rand(1, count, generator=generator),
+        "channels": torch.rand(1, count, 3, generator=generator),
+    }
+    made = {name: value.to(device).requires_grad_() for name, value in made.items()}
+    radii = torch.full((1, count), int(3 * size), dtype=torch.int32)
+    radii[:, -1] = 0
+    return {**made, "depths": torch.rand(1, count, generator=generator).to(device), "radii": radii.to(device)}
+
+
+def outcome(blend: Any, given: dict[str, Tensor], absgrad: bool = True, scale: int = 1) -> dict[str, Tensor]:
+    for name in NAMES:
+        given[name].grad = None
+    projected = cuda.Projected(**{name: given[name] for name in cuda.Projected._fields[:-1]}, directions=None)
+    frame = Cameras(torch.eye(4)[None], torch.eye(3)[None], scale * WIDTH, scale * HEIGHT, None)
+    options = RenderOptions(0.01, 1e10, 0.0, 0.3, None, "RGB", absgrad=absgrad, antialiased=False)
+    image, alpha = blend(projected, given["channels"], frame, options)
+    weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(0)).to(image.device)
+    ((image * weights).sum() + alpha.square().sum()).backward()
+    found = {"image": image, "alpha": alpha, **{name: given[name].grad for name in NAMES}}
+    if absgrad:
+        found["absgrad"] = vars(given["means2d"]).pop("absgrad")
+    return {name: value.detach().clone() for name, value in found.items()}
+
+
+def plain(device: str) -> Any:
+    """Blending by lists that are as long as needed; on CUDA gsplat's own."""
+    if device == "cuda":
+        return cuda.blend
+    return lambda *given: RecordedBlending(recorder("cpu"))(*given)
+
+
+def assert_the_same(found: dict[str, Tensor], expected: dict[str, Tensor], device: str) -> None:
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        difference = (found[name] - value).norm() / value.norm().clamp_min(1e-20)
+        assert difference <= (1e-4 if device == "cuda" else 1e-6), name  # gsplat adds gradients up in any order
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("absgrad", [True, False])
+def test_views_are_blended_as_without_a_recording(device: str, absgrad: bool) -> None:
+    blend = RecordedBlending(recorder(device))
+    for seed in range(6):
+        given = view(60, seed, device)
+        assert_the_same(outcome(blend, given, absgrad), outcome(plain(device), given, absgrad), device)
+    assert [each is not None for each in blend._calls._known.values()] == [True]
+
+
+def test_what_is_blended_is_the_reference() -> None:
+    given = view(60, 0, "cpu")
+    found = outcome(RecordedBlending(recorder("cpu")), given)
+    order = given["depths"][0].argsort()[given["radii"][0, given["depths"][0].argsort()] > 0]
+    splats = Splats(
+        order,
+        given["radii"][0, order],
+        given["means2d"][0, order],
+        given["conics"][0, order],
+        given["alphas"][0, order],
+        torch.cat([given["channels"][0, order], given["depths"][0, order, None]], dim=-1),
+    )
+    image, alpha = reference.blend(splats, given["means2d"], 0, WIDTH, HEIGHT, absgrad=False)
+    torch.testing.assert_close(found["image"][0], image[..., :3].detach())
+    torch.testing.assert_close(found["alpha"][0], alpha.detach())
+    torch.testing.assert_close(found["absgrad"], 3 * found["means2d"])
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_a_refinement_and_another_frame_begin_new_lists(device: str) -> None:
+    blend = RecordedBlending(recorder(device))
+    for count, scale in ((60, 1), (60, 2), (60, 1), (60, 2), (90, 1), (90, 1), (30, 2), (30, 1), (30, 2)):
+        given = view(count, count, device)
+        found = outcome(blend, given, scale=scale)
+        assert_the_same(found, outcome(plain(device), given, scale=scale), device)
+    assert len(blend._calls._known) == 2, "one for each frame"
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_a_view_that_needs_more_than_there_is_is_not_drawn_until_the_lists_are_longer(device: str) -> None:
+    blend = RecordedBlending(recorder(device))
+    small, large = view(60, 0, device, size=1.0), view(60, 0, device, size=6.0)
+    for _ in range(3):
+        assert outcome(blend, small)["image"].isfinite().all()
+    before = blend._capacity
+    missed = outcome(blend, large)
+    assert missed["image"].isnan().all()
+    for _ in range(2 * LOOK_EVERY):
+        outcome(blend, small)
+    assert blend._capacity > ROOM * before
+    assert_the_same(outcome(blend, large), outcome(plain(device), large), device)
+
+
+def test_lists_are_longer_before_a_view_misses_any() -> None:
+    blend = RecordedBlending(recorder("cpu"))
+    outcome(blend, view(60, 0, "cpu", size=3.0))
+    before = blend._capacity
+    nearly = [view(60, 0, "cpu", size=size) for size in torch.linspace(3.0, 6.0, 31).tolist()]
+    needed = [entries_of(each["means2d"][0], each["radii"][0], WIDTH, HEIGHT)[1].prod(dim=1).sum() for each in nearly]
+    given = next(each for each, count in zip(nearly, needed, strict=True) if TIGHT * before < count <= before)
+    for _ in range(2 * LOOK_EVERY):
+        assert outcome(blend, given)["image"].isfinite().all()
+    assert blend._capacity > before
