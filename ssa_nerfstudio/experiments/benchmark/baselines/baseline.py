@@ -9,6 +9,7 @@ names it. It may train on another dataset (`Baseline.dataset`), and its model ma
 from __future__ import annotations
 
 import importlib
+import inspect
 import json
 import zlib
 from collections.abc import Callable
@@ -86,7 +87,8 @@ class Baseline:
     def adapt(self, config: SSATrainerConfig) -> None:
         """Turn a method's configuration into this baseline's: its model, its settings, Adam with constant rates."""
         model = config.pipeline.model
-        shared = {each.name: getattr(model, each.name) for each in fields(model) if each.name != "_target"}
+        taken = {each.name for each in fields(model)} - self._declared() - {"_target"}
+        shared = {name: getattr(model, name) for name in taken}
         config.pipeline.model = self.config(**{**shared, **self.settings})
         shortened = FULL_LENGTH / config.max_num_iterations if self.per_photo else 1.0
         shortened = max(1.0, min(shortened, MAX_OVERLAY_FACTOR))
@@ -99,12 +101,12 @@ class Baseline:
         Raises:
             InputError: the baseline cannot be trained with the run's settings.
         """
-        self.check(_own_settings(run))
+        self.check(self._own_settings(run))
         if self.learning_rates and run.model.get("exposure", "off") != "off":
             raise InputError(f"{run.baseline} predicts photos without their exposures", "set exposure: off for it")
         if self.dataset is None:
             return data
-        digest = zlib.crc32(json.dumps(_own_settings(run), sort_keys=True).encode())
+        digest = zlib.crc32(json.dumps(self._own_settings(run), sort_keys=True).encode())
         return data.with_name(f"{data.name}-{run.baseline}-{digest:08x}")
 
     def make_dataset(self, run: Run, data: Path, mask: Path) -> None:
@@ -120,13 +122,18 @@ class Baseline:
             return
         with FileLock(made.with_name(f".{made.name}.lock")):  # another run on this machine may be making it
             if not made.exists():
-                self.dataset(Capture(data, category(run.effect), mask if run.mask else None, _own_settings(run)), made)
+                settings = self._own_settings(run)
+                self.dataset(Capture(data, category(run.effect), mask if run.mask else None, settings), made)
 
+    def _declared(self) -> set[str]:
+        """Settings that its classes declare; nerfstudio's may have others of the same name, such as `prompt`."""
+        classes = self.config.__mro__[: self.config.__mro__.index(SSASplatfactoModelConfig)]
+        return {name for each in classes for name in inspect.get_annotations(each)}
 
-def _own_settings(run: Run) -> dict[str, Any]:
-    """What a run sets of settings that splatfacto and the plugin have not."""
-    shared = {each.name for each in fields(SSASplatfactoModelConfig)}
-    return {name: value for name, value in run.model.items() if name not in shared}
+    def _own_settings(self, run: Run) -> dict[str, Any]:
+        """What a run sets of the baseline's settings, and not of splatfacto's and the plugin's."""
+        shared = {each.name for each in fields(SSASplatfactoModelConfig)} - self._declared()
+        return {name: value for name, value in run.model.items() if name not in shared}
 
 
 def find(name: str) -> Baseline:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import json
 import re
 import sys
@@ -19,7 +21,10 @@ from ssa_nerfstudio.data.dataset import View
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.baselines import diffusion_weights, difix3d, flux_kontext
 from ssa_nerfstudio.experiments.benchmark.baselines.baseline import Capture
+from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import read_benchmark
+from ssa_nerfstudio.experiments.benchmark.specification.plan import plan
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
+from ssa_nerfstudio.plugin.methods import METHODS
 
 pytest.importorskip("diffusers", reason="pip install '.[diffusion]'")
 
@@ -108,6 +113,27 @@ def test_flux_is_asked_with_the_papers_guidance_and_steps_and_one_seed(capture, 
     assert arguments["prompt"] == ["remove the car"] * 24
     assert [generator.initial_seed() for generator in arguments["generator"]] == [3] * 24
     assert flux_kontext.RestoredConfig().restoration_steps == 28
+
+
+def test_an_instruction_that_a_candidate_states_is_the_one_that_is_asked(tmp_path):
+    """nerfstudio's models have a setting of that name, too, which is None."""
+    stated = "{method: flux-kontext, weights: somebody/weights, prompt: remove the %s}"
+    (tmp_path / "a.yaml").write_text(
+        f"scenes: [{{data: demo}}]\ncandidates: {{car: {stated % 'car'}, rain: {stated % 'rain'}}}\n"
+        "parts: [{methods: [car, rain], effects: [mud], steps: 5}]"
+    )
+    asked = []
+    baseline = dataclasses.replace(
+        flux_kontext.BASELINE, dataset=lambda capture, made: asked.append((capture.settings["prompt"], made))
+    )
+    for run in plan(read_benchmark(str(tmp_path / "a.yaml"))):
+        baseline.make_dataset(run, tmp_path / "data", tmp_path / "mask.png")
+    (car, first), (rain, second) = asked
+    assert (car, rain) == ("remove the car", "remove the rain")
+    assert first != second
+    config = copy.deepcopy(METHODS["ssa-splatfacto"])
+    baseline.adapt(config)
+    assert vars(config.pipeline.model)["prompt"] == ""
 
 
 def test_a_batch_has_photos_of_one_size_alone():
