@@ -56,10 +56,11 @@ def configure(
     datamanager.train_cameras_sampling_seed += seed
     datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
     adapt(config)
+    settings = {each.name for each in dataclasses.fields(config.pipeline.model)} - {"_target"}
     kinds: dict[str, Any] = get_type_hints(type(config.pipeline.model), include_extras=True)
     for name, value in (model or {}).items():
-        if not hasattr(config.pipeline.model, name):
-            close = difflib.get_close_matches(name, vars(config.pipeline.model), n=1)
+        if name not in settings:
+            close = difflib.get_close_matches(name, settings, n=1)
             raise InputError(f"the model has no setting {name!r}", f"{close[0]!r} may be meant" if close else "")
         built = dataclasses.is_dataclass(value)  # by a caller in Python; files hold keys and values
         setattr(config.pipeline.model, name, value if built else build(kinds[name], value, f"setting {name!r}"))

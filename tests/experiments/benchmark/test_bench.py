@@ -294,6 +294,12 @@ def test_a_misspelt_setting_is_refused_before_anything_runs(tmp_path, capsys):
         ("method: spotless-mlp, grouping: mpl", "setting 'grouping': Input should be 'mlp' or 'agg', got 'mpl'"),
         ("method: robustnerf, inlier_quantile: 70", "setting 'inlier_quantile': Input should be less than or equal"),
         ("method: desplat, distractors: 0", "setting 'distractors': Input should be greater than or equal to 1, got 0"),
+        ("method: difix3d, weights: 5", "no weights are stated (nvidia/difix_ref"),
+        ("method: spotless-mlp, features: [a]", "no weights are stated (stabilityai/stable-diffusion-2-1"),
+        ("setup: 3", "the model has no setting 'setup'"),
+        ("__class__: 3", "the model has no setting '__class__'"),
+        ("_target: 3", "the model has no setting '_target'"),
+        ("own_steps: [refine_every]", "the model has no setting 'own_steps'"),
     ],
 )
 def test_a_value_that_a_setting_cannot_have_is_refused_before_anything_runs(tmp_path, capsys, settings, refused):

@@ -14,14 +14,18 @@ from PIL import Image
 from ssa_nerfstudio.errors import InputError
 
 
-def require(weights: str, what: str) -> None:
+def require(weights: object, what: str) -> None:
     """Refuse to begin without weights or without diffusers.
 
+    Args:
+        weights: what a benchmark file states, which may be anything; text is a folder or a hub's id.
+        what: which weights are meant and under which licence.
+
     Raises:
-        InputError: `weights` is empty or a folder without a pipeline, or diffusers is not installed; in one line, with
-            what to fetch.
+        InputError: `weights` is empty, no text, or a folder without a pipeline, or diffusers is not installed; in one
+            line, with what to fetch.
     """
-    if not weights:
+    if not (weights and isinstance(weights, str)):
         raise InputError(f"no weights are stated ({what})", "state a folder that has them, or the id: weights")
     folder = Path(weights)
     # A hub's id is a relative path, too, of a folder that is not there.
