@@ -213,7 +213,8 @@ class RecordedCalls:
             return function(*inputs, *parameters)
         epoch = epoch, *((each.data_ptr(), each.shape) for each in parameters)
         if epoch != self._epoch:
-            self._known, self._record, self._epoch = {}, None, epoch
+            self.forget()
+            self._epoch = epoch
         kind = (kind, *((each.shape, each.dtype) for each in inputs))
         if kind not in self._known:
             if len(self._known) < self._limit:
@@ -229,6 +230,10 @@ class RecordedCalls:
                 _warn(error)
                 return function(*inputs, *parameters)
         return recorded(*inputs)
+
+    def forget(self) -> None:
+        """Drop all recordings, and with them their memory and the parameters that they were made of."""
+        self._known, self._record, self._epoch = {}, None, None
 
 
 class RecordedChanges:

@@ -60,6 +60,10 @@ class SplatRenderer:
         device = parameters["means"].device
         gsplat = device.type == "cuda" and self._name in ("auto", "gsplat")
         few = len(parameters["means"]) <= MOST_RECORDED
+        if not few:
+            # Those of fewer, before the last refinement.
+            self.projections.forget()
+            self._blending = None
         if gsplat and few and torch.is_grad_enabled() and options["render_mode"] == "RGB" and graphs_are_usable():
             antialiased = options.pop("rasterize_mode") == "antialiased"
             settings = RenderOptions(

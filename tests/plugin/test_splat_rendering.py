@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Mapping
 
 import pytest
@@ -13,6 +15,7 @@ from recordings import run_again
 from torch import Tensor
 
 from ssa_nerfstudio._system.cuda_graphs import RecordedCalls
+from ssa_nerfstudio.plugin import splat_rendering
 from ssa_nerfstudio.plugin.splat_rendering import PARAMETERS, SplatRenderer, activated, render_recorded
 from ssa_nerfstudio.rasterization import cuda
 from ssa_nerfstudio.rasterization.interface import Cameras, RenderOptions
@@ -129,6 +132,24 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
         torch.testing.assert_close(found[0], found[1])
     assert [each is not None for each in calls._known.values()] == [True]
     assert len(found[0]) == (8 if sh_degree is not None else 7)
+
+
+def test_recordings_of_fewer_gaussians_are_given_up_once_there_are_too_many_to_record(monkeypatch):
+    """They would hold gradients and parameters of a scene that is no more."""
+    monkeypatch.setattr(splat_rendering, "MOST_RECORDED", 50)
+    renderer = SplatRenderer("cpu")
+    renderer.projections = RecordedCalls(run_again)
+    former = torch.nn.Parameter(torch.ones(3))
+    for _ in range(2):
+        renderer.projections(lambda parameter: (2 * parameter,), [], [former], "kind")
+    kept = weakref.ref(former)
+    del former
+    outcome(renderer, parameters(50, "cpu"), 0, 3, "classic")
+    gc.collect()
+    assert kept() is not None
+    outcome(renderer, parameters(51, "cpu"), 0, 3, "classic")
+    gc.collect()
+    assert kept() is None
 
 
 def test_what_is_drawn_is_the_activated_scene():
