@@ -130,10 +130,12 @@ def staged_file(path: Path) -> Iterator[Path]:
                 f"another process is writing {path}", "wait until it ends, or choose another place"
             ) from error
         try:
+            os.truncate(part, 0)
             yield part
             part.replace(path)
-        finally:
+        except BaseException:  # and not after the replacement: it would be that of another process
             part.unlink(missing_ok=True)
+            raise
 
 
 @contextmanager

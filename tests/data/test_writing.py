@@ -76,9 +76,23 @@ def test_a_file_is_replaced_at_the_end_or_stays_as_it_was(tmp_path):
 
 def test_what_a_killed_process_left_is_overwritten(tmp_path):
     (tmp_path / ".file.part").write_text("half of an earlier attempt")
-    with staged_file(tmp_path / "file") as part:
-        part.write_text("new")
+    with staged_file(tmp_path / "file") as part, part.open("a") as file:
+        file.write("new")
+    assert (tmp_path / "file").read_text() == "new"
     assert names(tmp_path) == ["file"]
+
+
+def test_what_another_process_begins_once_a_file_is_written_stays(tmp_path, monkeypatch):
+    replace = Path.replace
+
+    def replace_and_go_on(part: Path, path: Path) -> None:
+        replace(part, path)
+        part.write_text("of the next")
+
+    monkeypatch.setattr(Path, "replace", replace_and_go_on)
+    with staged_file(tmp_path / "file"):
+        pass
+    assert names(tmp_path) == [".file.part", "file"]
 
 
 KILLED = """
