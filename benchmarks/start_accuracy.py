@@ -21,16 +21,20 @@ from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatama
 
 from ssa_nerfstudio import evidence
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
+LAYERS = "layers/undistorted.npz"
+"""Of a dataset in which an artifact was drawn: the truth."""
 DETECTION = {
     "edge_evidence": (
         "EVIDENCE_THRESHOLDS",
@@ -82,12 +86,13 @@ class Command:
         """Measure dataset by dataset, and print a table.
 
         Raises:
-            InputError: no dataset is given, or one of them is none.
+            InputError: no dataset is given, or one of them is none, has no points, or had an artifact drawn whose layers
+                are gone.
         """
         if not self.data:
             raise InputError("no dataset is given", "add --data DIR, as ssa simulate writes it")
         for path in self.data:
-            Transforms.read(path)
+            _check(path)
         known = {}
         if self.output is not None and self.output.exists():
             lines = map(json.loads, self.output.read_text(encoding="utf-8").splitlines())
@@ -109,6 +114,18 @@ class Command:
             _print_sensitivity(known, [path.name for path in self.data])
 
 
+def _check(path: Path) -> None:
+    """Refuse what cannot be measured, and what would be taken for a clean dataset and is none."""
+    if path.is_file():
+        raise InputError(f"{path} is a file", "name the dataset's folder, where its layers are looked for")
+    if not (points := Transforms.read(path).meta.get("ply_file_path")):
+        raise InputError(f"{path} states no points (ply_file_path)", "choose a dataset that has some")
+    check_points(path / points)
+    drawn = read(path / "scene.yaml").get("effects") if (path / "scene.yaml").is_file() else None
+    if drawn and not (path / LAYERS).is_file():
+        raise InputError(f"{path} has no {LAYERS}, though its scene.yaml names effects", "make it with ssa simulate")
+
+
 def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str, Any]]:
     """Errors of the start with each variant of the constants."""
     if not variants:
@@ -123,8 +140,8 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     statistics = accumulate((view.image, view.mask) for view in views)
     plain, guide = detect(statistics), guide_of(statistics)
     truth = torch.cat([torch.ones(*statistics.size, 1), torch.zeros(*statistics.size, 3)], dim=-1)
-    if (path / "layers/undistorted.npz").is_file():
-        with np.load(path / "layers/undistorted.npz") as layers:
+    if (path / LAYERS).is_file():
+        with np.load(path / LAYERS) as layers:
             parts = layers["T"].mean(axis=-1, keepdims=True), layers["B"]
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)

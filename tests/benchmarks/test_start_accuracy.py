@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.start_accuracy import Command
+from benchmarks.start_accuracy import LAYERS, Command
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence import layer_estimate
@@ -41,3 +41,16 @@ def test_what_is_not_drawn_on_a_clean_capture_is_an_error(write_built_in_scene, 
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"transforms\.json does not exist"):
         Command([tmp_path]).run()
+
+
+def test_what_would_be_taken_for_a_clean_capture_is_refused(write_built_in_scene, tmp_path):
+    clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
+    main(["simulate", "--data", str(clean), "--output", str(tmp_path / "covered"), "--effects", "dashboard"])
+    with pytest.raises(InputError, match="is a file; name the dataset's folder"):
+        Command([tmp_path / "covered" / "transforms.json"]).run()
+    (tmp_path / "covered" / LAYERS).unlink()
+    with pytest.raises(InputError, match=f"has no {LAYERS}, though"):
+        Command([tmp_path / "covered"]).run()
+    (clean / "sparse_pc.ply").unlink()
+    with pytest.raises(InputError, match=r"sparse_pc\.ply cannot be read"):
+        Command([clean]).run()
