@@ -13,6 +13,7 @@ import pytest
 import tyro
 
 from ssa_nerfstudio.cli import COMMANDS, arguments, main
+from ssa_nerfstudio.experiments.configuration import shipped
 
 
 def command_of(name: str) -> type:
@@ -174,3 +175,12 @@ def test_valid_options_are_taken():
     assert taken == command(Path("x"), time_limit=2.0)
     taken = arguments.read(command, ["--output=x", "--time-limit", "None", "--threads", "2"], "ssa bench", "")
     assert taken == command(Path("x"), threads=2)
+
+
+@pytest.mark.parametrize("name", ["bench", "tradeoff"])
+def test_help_names_every_benchmark_that_is_shipped(name, capsys):
+    with pytest.raises(SystemExit):
+        main([name, "--help"])
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    listed = shown.partition("BENCHMARK ")[2].partition(", or a .yaml file")[0]
+    assert sorted(re.findall(r"[\w-]+", listed.rpartition("BENCHMARK ")[2] or listed)) == sorted(shipped("benchmarks"))
