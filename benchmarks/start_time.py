@@ -54,8 +54,12 @@ class Command:
         """Print a line for each method: seconds of each round, their median, and its ratio to the first method's.
 
         Raises:
-            InputError: the dataset cannot be trained on, or a start failed.
+            InputError: an option is out of range, the dataset cannot be trained on, or a start failed.
         """
+        if self.rounds < 1:
+            raise InputError(f"--rounds must be at least 1, got {self.rounds}")
+        if not self.methods:
+            raise InputError("no method is given", "leave --methods out, or name some")
         Transforms.read(self.data)
         seconds: dict[str, list[float]] = {method: [] for method in self.methods}
         for _ in range(self.rounds):
