@@ -86,22 +86,18 @@ class Command:
         """Measure dataset by dataset, and print a table.
 
         Raises:
-            InputError: no dataset is given, or one of them is none, has no points, or had an artifact drawn whose layers
-                are gone.
+            InputError: no dataset is given, or one of them is none, has no points, or lacks the layers of the artifact
+                that was drawn; or `output` holds something else.
         """
         if not self.data:
             raise InputError("no dataset is given", "add --data DIR, as ssa simulate writes it")
         for path in self.data:
             _check(path)
-        known = {}
-        if self.output is not None and self.output.exists():
-            lines = map(json.loads, self.output.read_text(encoding="utf-8").splitlines())
-            known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
-        variants = [("", 1.0)]
-        if self.vary:
-            groups = [*DETECTION.items(), *ESTIMATE.items()]
-            names = [f"{module}.{name}" for module, names in groups for name in names]
-            variants += [(name, factor) for name in names for factor in (0.5, 2.0)]
+        lines = _earlier(self.output) if self.output is not None and self.output.exists() else []
+        known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
+        groups = [*DETECTION.items(), *ESTIMATE.items()] if self.vary else []
+        constants = [f"{module}.{name}" for module, names in groups for name in names]
+        variants = [("", 1.0), *((name, factor) for name in constants for factor in (0.5, 2.0))]
         for path in self.data:
             missing = [variant for variant in variants if (path.name, *variant) not in known]
             for result in _measure(path, missing):
@@ -111,7 +107,16 @@ class Command:
                     with self.output.open("a", encoding="utf-8") as file:
                         file.write(json.dumps(result) + "\n")
         if self.vary:
-            _print_sensitivity(known, [path.name for path in self.data])
+            _print_sensitivity(known, [path.name for path in self.data], constants)
+
+
+def _earlier(path: Path) -> list[dict[str, Any]]:
+    """Results of earlier calls. What an earlier revision wrote, which did not state the verdict, is measured again."""
+    try:
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [line for line in lines if "verdict" in line and (line["data"], line["constant"], line["factor"])]
+    except (ValueError, TypeError, LookupError) as error:
+        raise InputError(f"{path} holds no results of this script ({error})", "choose another --output") from error
 
 
 def _check(path: Path) -> None:
@@ -201,7 +206,9 @@ def _times(value: float, factor: float) -> float:
     return 2 * round((value * factor - 1) / 2) + 1 if value % 2 else max(1, round(value * factor))
 
 
-def _print_sensitivity(known: dict[tuple[str, str, float], dict[str, Any]], names: list[str]) -> None:
+def _print_sensitivity(
+    known: dict[tuple[str, str, float], dict[str, Any]], names: list[str], constants: list[str]
+) -> None:
     """A row for each constant at half and at twice its value: mean errors where artifacts are, and elsewhere; verdicts.
 
     A changed verdict is one of detection, or whether the artifact adds light.
@@ -209,7 +216,8 @@ def _print_sensitivity(known: dict[tuple[str, str, float], dict[str, Any]], name
 
     def errors(constant: str, factor: float) -> str:
         rows = [known[name, constant, factor] for name in names]
-        on = np.mean([row["T_on"] + row["B_on"] for row in rows if row["T_on"] + row["B_on"] > 0])
+        drawn = [row["T_on"] + row["B_on"] for row in rows if row["T_on"] + row["B_on"] > 0]
+        on = np.mean(drawn) if drawn else 0.0
         off = np.mean([row["T_off"] + row["B_off"] for row in rows])
         plain = [known[name, "", 1.0] for name in names]
         changed = sum(
@@ -221,7 +229,7 @@ def _print_sensitivity(known: dict[tuple[str, str, float], dict[str, Any]], name
     columns = "there | elsewhere | verdicts changed"
     print(f"\n| constant | half: {columns} | twice: {columns} |\n|{'---|' * 7}")
     print(f"| all as they are | {errors('', 1.0)} | {errors('', 1.0)} |")
-    for constant in dict.fromkeys(constant for _, constant, _ in known if constant):
+    for constant in constants:
         print(f"| {constant} | {errors(constant, 0.5)} | {errors(constant, 2.0)} |")
 
 

@@ -16,11 +16,13 @@ def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_sc
     clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
     main(["simulate", "--data", str(clean), "--output", str(tmp_path / "covered"), "--effects", "dashboard"])
     output = tmp_path / "errors.jsonl"
+    former = {"data": "covered", "constant": "initialization.GONE", "factor": 0.5, "T_on": 0.1}  # without a verdict
+    output.write_text(json.dumps(former) + "\n")
     before = layer_estimate.ROUNDS
     for _ in range(2):
         Command([tmp_path / "covered"], vary=True, output=output).run()
     assert before == layer_estimate.ROUNDS
-    rows = [json.loads(line) for line in output.read_text().splitlines()]
+    _, *rows = [json.loads(line) for line in output.read_text().splitlines()]
     assert len({(row["constant"], row["factor"]) for row in rows}) == len(rows)
     as_it_is, *others = rows
     assert as_it_is["constant"] == ""
@@ -36,6 +38,14 @@ def test_what_is_not_drawn_on_a_clean_capture_is_an_error(write_built_in_scene, 
     row = json.loads(output.read_text())
     assert row["T_on"] == row["B_on"] == 0
     assert row["verdict"] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("text", ['{"data"', "3", '{"verdict": "none"}'])
+def test_a_file_of_something_else_is_refused(write_built_in_scene, tmp_path, text):
+    clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
+    (tmp_path / "a.jsonl").write_text(text)
+    with pytest.raises(InputError, match=r"a\.jsonl holds no results of this script"):
+        Command([clean], output=tmp_path / "a.jsonl").run()
 
 
 def test_a_folder_that_is_no_dataset_is_refused(tmp_path):
