@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -46,12 +47,12 @@ def locked_folder(folder: Path, command: str) -> Iterator[None]:
 
 
 @contextmanager
-def held(path: Path, wait: bool = False) -> Iterator[bool]:
+def held(path: Path, wait: float = 0.0) -> Iterator[bool]:
     """Lock a file or folder itself, of which nothing is left when the process ends, however it does.
 
     Args:
         path: it exists.
-        wait: for another process that holds it.
+        wait: seconds for another process that holds it.
 
     Yields:
         Whether it is locked; the file system may have no locks, and what may not be read cannot be locked.
@@ -66,15 +67,27 @@ def held(path: Path, wait: bool = False) -> Iterator[bool]:
         yield False
         return
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            locked = True
-        except BlockingIOError:
-            raise
-        except OSError:
-            locked = False
+        locked = _locked(descriptor, time.monotonic() + wait)
         if not (path.exists() and os.path.samestat(os.fstat(descriptor), path.stat())):
             raise BlockingIOError(f"{path} was moved by another process")
         yield locked
     finally:
         os.close(descriptor)
+
+
+def _locked(descriptor: int, until: float) -> bool:
+    """Lock a file by its descriptor, or say that the file system has no locks.
+
+    Raises:
+        BlockingIOError: another process holds it at that time of the monotonic clock.
+    """
+    while True:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return True
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                raise
+            time.sleep(0.01)
+        except OSError:
+            return False

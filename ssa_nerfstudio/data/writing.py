@@ -16,6 +16,8 @@ from ssa_nerfstudio.errors import InputError
 
 _PART = ".part"
 _EARLIER = ".earlier"
+_PATIENCE = 2.0
+"""Seconds to wait for another process that makes a folder beside an output; that takes milliseconds."""
 
 
 def is_text(name: str) -> bool:
@@ -84,7 +86,11 @@ def staged_folder(output: Path, replaces: bool = False) -> Iterator[Path]:
 def _scratch(output: Path) -> Iterator[Path]:
     """A folder beside an output that is locked while it is in use, so that the next process knows it as abandoned."""
     with ExitStack() as stack:
-        with held(output.parent, wait=True) as alone:  # nobody makes one, and has not locked it yet
+        with ExitStack() as making:
+            alone = False
+            with suppress(BlockingIOError):  # somebody else's, such as `flock . ssa ...`: nothing is removed
+                # Nobody makes one, and has not locked it yet.
+                alone = making.enter_context(held(output.parent, wait=_PATIENCE))
             for left in output.parent.glob(f".{glob.escape(output.name)}.????????{_PART}") if alone else ():
                 _remove_abandoned(left, output.name)
             made = tempfile.TemporaryDirectory(prefix=f".{output.name}.", suffix=_PART, dir=output.parent)

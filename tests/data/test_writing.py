@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from ssa_nerfstudio.data import writing
 from ssa_nerfstudio.data.writing import staged_file, staged_files, staged_folder, unwritable_as_input_error, write_text
 from ssa_nerfstudio.errors import InputError
 
@@ -125,6 +127,20 @@ def test_a_folder_that_a_killed_process_left_is_removed_by_the_next_and_not_befo
     with staged_folder(tmp_path / "out"):
         pass
     assert names(tmp_path) == sorted([*kept, "out"])
+
+
+def test_a_lock_of_the_user_on_the_folder_above_is_not_waited_for_for_ever(tmp_path, monkeypatch):
+    """As in `flock . ssa simulate --output out`."""
+    monkeypatch.setattr(writing, "_PATIENCE", 0.05)
+    (tmp_path / ".out.abcdefgh.part").mkdir()
+    descriptor = os.open(tmp_path, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        with staged_folder(tmp_path / "out") as folder:
+            (folder / "file").write_text("")
+    finally:
+        os.close(descriptor)
+    assert names(tmp_path) == [".out.abcdefgh.part", "out", "out/file"]  # what could be another's stays
 
 
 def test_an_earlier_folder_that_a_killed_process_was_replacing_is_kept(tmp_path):
