@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import inspect
+import os
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -79,6 +80,22 @@ def as_ctrl_c() -> Iterator[None]:
             sys.unraisablehook = former
             if received:
                 raise SystemExit(exit_code(received[0]))
+
+
+@contextmanager
+def ended_at_once(program: str) -> Iterator[None]:
+    """End the process where a signal asks for it: nothing has begun, and libraries make other errors of interrupts.
+
+    For imports of seconds, whose end `as_ctrl_c` would wait for.
+    """
+
+    def end(number: int, _frame: object) -> None:
+        with suppress(OSError):
+            os.write(2, f"{program} was stopped\n".encode())
+        os._exit(exit_code(number))
+
+    with handled(end, [signal.SIGINT, *SIGNALS]):
+        yield
 
 
 def _imports(frame: FrameType | None) -> int:

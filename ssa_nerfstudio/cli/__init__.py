@@ -5,11 +5,10 @@ from __future__ import annotations
 import importlib
 import io
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 
 from ssa_nerfstudio._system import ctrl_c, terminal_messages, termination
@@ -103,7 +102,7 @@ def _run(name: str, options: list[str]) -> None:
     if name not in COMMANDS:
         raise InputError(f"there is no command {name!r}", f"choose one of {', '.join(COMMANDS)} (ssa --help)")
     try:
-        with _ended_at_once(f"ssa {name}"):
+        with termination.ended_at_once(f"ssa {name}"):
             from ssa_nerfstudio.cli import arguments
 
             command = importlib.import_module(f"ssa_nerfstudio.cli.{name.replace('-', '_')}").Command
@@ -123,19 +122,6 @@ def _run(name: str, options: list[str]) -> None:
         raise InputError(
             f"ssa {name} needs a package that is not installed ({error})", "pip install 'ssa-nerfstudio[experiments]'"
         ) from error
-
-
-@contextmanager
-def _ended_at_once(program: str) -> Iterator[None]:
-    """End the process where a signal asks for it: nothing has begun, and libraries make other errors of interrupts."""
-
-    def end(number: int, _frame: object) -> None:
-        with suppress(OSError):
-            os.write(2, f"{program} was stopped\n".encode())
-        os._exit(termination.exit_code(number))
-
-    with termination.handled(end, [signal.SIGINT, *termination.SIGNALS]):
-        yield
 
 
 def _usage() -> str:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from ssa_nerfstudio._system import termination
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
 
@@ -36,8 +37,9 @@ class Command:
             check_training(Transforms.read(self.data))
         console = plain_console()
         console.print("Loading nerfstudio ...")
-        from ssa_nerfstudio.experiments.demo import comparison as run
-        from ssa_nerfstudio.experiments.demo import demo_report as report
+        with termination.ended_at_once("ssa demo"):
+            from ssa_nerfstudio.experiments.demo import comparison as run
+            from ssa_nerfstudio.experiments.demo import demo_report as report
 
         title = TextColumn("{task.description}", markup=False)
         columns = (title, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

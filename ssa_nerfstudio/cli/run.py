@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ssa_nerfstudio._system import ctrl_c
+from ssa_nerfstudio._system import ctrl_c, termination
 from ssa_nerfstudio.cli import arguments
 from ssa_nerfstudio.errors import InputError
 
@@ -101,14 +101,15 @@ class Command:
             raise InputError(f"--steps must be at least 1, got {self.steps}")
         console = Console(highlight=False, soft_wrap=True)
         console.print("Loading nerfstudio ...")
-        from ssa_nerfstudio.data.panorama_entry import read_panorama
-        from ssa_nerfstudio.data.transforms import Transforms
-        from ssa_nerfstudio.workflow.finished_training import Evaluation
-        from ssa_nerfstudio.workflow.photos_to_splats import EVALUATION, RECORD, stages
-        from ssa_nerfstudio.workflow.resumable_training import config_file
-        from ssa_nerfstudio.workflow.run_report import REPORT, report_page
-        from ssa_nerfstudio.workflow.stage_display import terminal_display
-        from ssa_nerfstudio.workflow.stages import RunRecord, check_run_folder, run_stages
+        with termination.ended_at_once("ssa run"):
+            from ssa_nerfstudio.data.panorama_entry import read_panorama
+            from ssa_nerfstudio.data.transforms import Transforms
+            from ssa_nerfstudio.workflow.finished_training import Evaluation
+            from ssa_nerfstudio.workflow.photos_to_splats import EVALUATION, RECORD, stages
+            from ssa_nerfstudio.workflow.resumable_training import config_file
+            from ssa_nerfstudio.workflow.run_report import REPORT, report_page
+            from ssa_nerfstudio.workflow.stage_display import terminal_display
+            from ssa_nerfstudio.workflow.stages import RunRecord, check_run_folder, run_stages
 
         check_run_folder(self.output / RECORD)
         choices, plan = self._plan(console)

@@ -266,3 +266,21 @@ def test_a_name_that_is_no_text(tmp_path):
     done = subprocess.run([*SSA, "detect", "--data", folder], capture_output=True, text=True, cwd=tmp_path)
     assert done.returncode == 2
     assert "holds no photo" in in_one_line(done.stderr)
+
+
+@pytest.mark.parametrize("words", [["run", "photos", "--output", "out"], ["demo", "--output", "out"]])
+def test_loading_nerfstudio_is_not_waited_for(words, tmp_path):
+    """It takes seconds, and as long as a minute on a busy machine."""
+    stub = tmp_path / "stubs" / "nerfstudio"
+    stub.mkdir(parents=True)
+    (stub / "__init__.py").write_text("import time; print('importing', flush=True); time.sleep(300)")
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(stub.parent), *sys.path])}
+    running = subprocess.Popen(
+        [*SSA, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+    )
+    assert running.stdout is not None
+    assert [running.stdout.readline() for _ in range(2)] == ["Loading nerfstudio ...\n", "importing\n"]
+    running.terminate()
+    _, err = running.communicate(timeout=60)
+    assert (running.returncode, err) == (143, f"ssa {words[0]} was stopped\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["stubs"]
