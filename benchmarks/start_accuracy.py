@@ -64,7 +64,6 @@ ESTIMATE = {
         "MIN_BRIGHTEST",
         "MIN_OPACITY",
         "CERTAIN_OPACITY",
-        "MIN_ADDED_SHARE",
     ),
     "guided_upsampling": ("RADIUS", "NOISE"),
 }

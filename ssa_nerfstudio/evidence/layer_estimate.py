@@ -36,9 +36,6 @@ CERTAIN_OPACITY = 0.3
 """Opacities above this are rarely noise: at most 1.2 % of the frame of three clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges."""
-MIN_ADDED_SHARE = 0.1
-"""Share of the squared opacities that has to be added light: 0.22 to 0.36 for rain on three captures, 0.002 for text
-beside a thumb."""
 _GRAY_LEVEL = 1 / 255
 
 
@@ -67,18 +64,16 @@ class LayerEstimate:
     def adds_light(self) -> bool:
         """Whether the artifact adds light and hides nothing.
 
-        What hides at most replaces the scene's light by its own, B <= 1 - T. Details of B (differences from the mean
-        over a window) that exceed it are added light; true if they are the greater part, and added light no small
-        part of the artifact: bright text beside a thumb is no reason to let the thumb add light.
+        What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
+        that is the greater part of all light where there is more than noise, and itself more than noise beside what
+        is hidden: bright text beside a black thumb is no reason to let the thumb add light. By squares.
         """
-        hidden, added = 1 - self.transmittance, self.addition.amax(dim=-1, keepdim=True)
-        excess = (1 - hidden / added.clamp_min(1e-6)).clamp(0, 1)
-        detail = (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0).square()
-        opacity = self.opacity()
+        opacity, added = self.opacity(), self.addition.amax(dim=-1, keepdim=True)
         present = opacity > MIN_OPACITY
-        light, whole = (excess * added.square())[present].sum(), opacity[present].square().sum()
-        mostly = (detail * excess).sum() > 0.5 * detail.sum()
-        return bool(mostly & (light > MIN_ADDED_SHARE * whole))
+        excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)
+        light = (excess * added.square())[present].sum()
+        lit, whole = (x[present].square().sum() for x in (added, opacity))
+        return bool((light > 0.5 * lit) & (light > MIN_OPACITY * whole))
 
 
 @torch.no_grad()

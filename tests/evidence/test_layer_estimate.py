@@ -80,14 +80,14 @@ def test_layers_come_out_without_an_edge_or_a_decision_of_kind(name: str) -> Non
     assert found.share() == pytest.approx(float(present.float().mean()), abs=0.03)
 
 
-@pytest.mark.parametrize(("hidden", "adds"), [(0.0, True), (0.9, False)])
-def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, adds: bool) -> None:
+@pytest.mark.parametrize(("hidden", "color", "adds"), [(0.0, 0.1, True), (0.9, 0.1, False), (0.9, 0.01, False)])
+def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, color: float, adds: bool) -> None:
     """Text of which too few points are seen to tell what it hides, alone and beside a soft, dark thumb."""
     thumb = hidden * disc()
     text = torch.zeros(HEIGHT, WIDTH, 1)
     text[30:33, 2:20:3] = 0.2
     layers = LayerEstimate(
-        1 - thumb, torch.maximum(text, 0.1 * thumb).expand(-1, -1, 3), torch.ones_like(thumb), 0 * thumb
+        1 - thumb, torch.maximum(text, color * thumb).expand(-1, -1, 3), torch.ones_like(thumb), 0 * thumb
     )
     assert layers.adds_light() == adds
 
