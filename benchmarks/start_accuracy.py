@@ -38,7 +38,6 @@ LAYERS = "layers/undistorted.npz"
 DETECTION = {
     "edge_evidence": (
         "EVIDENCE_THRESHOLDS",
-        "WEAK_EVIDENCE",
         "MIN_GRADIENT",
         "MIN_EDGE_SHARES",
         "DISPLACEMENT_WINDOWS",

@@ -21,8 +21,6 @@ from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 EVIDENCE_THRESHOLDS = (6.0, 7.0)
 """Evidence from which on a pixel is a static edge, at the fine and the coarse scale."""
-WEAK_EVIDENCE = 0.5
-"""Evidence relative to its threshold from which on an edge continues a static one (Canny's lower threshold)."""
 MIN_GRADIENT = 1 / 255
 """Mean gradients below this (white = 1, per working pixel) never count: codecs and sensors cause them."""
 COARSE_FACTOR = 4
@@ -69,14 +67,12 @@ class EdgeEvidence:
 
     @property
     def outlines(self) -> np.ndarray:
-        """`mask`, and the weaker edges that are connected to it and do not move: uint8 [h, w].
+        """`mask`, and edges of three standard errors that do not move: uint8 [h, w].
 
         An edge is as strong as its contrast, which changes along an outline with the scene behind it.
         """
-        weak = (self.fields[0] >= WEAK_EVIDENCE * EVIDENCE_THRESHOLDS[0]) & self.still[0]
-        edges = self.mask | weak.cpu().numpy().astype(np.uint8)
-        labels = cv2.connectedComponents(cv2.dilate(edges, _NEIGHBORS))[1]
-        return edges * np.isin(labels, np.unique(labels[self.mask > 0]))
+        weak = (self.fields[0] >= EVIDENCE_THRESHOLDS[0] / 2) & self.still[0]
+        return self.mask | weak.cpu().numpy().astype(np.uint8)
 
 
 def measure_edges(statistics: ImageStatistics) -> EdgeEvidence:
