@@ -51,7 +51,6 @@ DETECTION = {
 """Constants of the modules in `evidence` that detect, which comes first."""
 ESTIMATE = {
     "point_samples": ("WORKING_SIZE", "OCCLUSION_TOLERANCE", "OCCLUSION_RADIUS"),
-    "falloff": ("SIGNIFICANCE",),
     "expected_layers": ("DETAIL_RADIUS",),
     "layer_estimate": (
         "ROUNDS",
@@ -60,7 +59,6 @@ ESTIMATE = {
         "SMOOTHNESS_FLOOR",
         "OUTLIER_SCALE",
         "CLEAR_SHARE",
-        "MIN_BRIGHTEST",
         "MIN_OPACITY",
         "CERTAIN_OPACITY",
     ),

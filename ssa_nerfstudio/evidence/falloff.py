@@ -11,12 +11,11 @@ import torch
 from scipy.special import fdtrc
 from torch import Tensor
 
+from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
 from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE
 from ssa_nerfstudio.evidence.photo_exposure import DAMPING, MIN_SCALE, OUTLIER_SCALE, ROUNDS, USABLE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 
-SIGNIFICANCE = 0.001
-"""Chance that modes of equal variance have as large a share in radial ones, and in r^2: below both is a falloff."""
 MAX_SAMPLES = 20_000
 """Of more, those of a regular subset of the points are used: a falloff has five parameters."""
 MAX_VIEWS = 128
