@@ -28,8 +28,6 @@ OUTLIER_SCALE = 3.0
 """Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden."""
 CLEAR_SHARE = 0.2
 """Share of the frame that is taken for clear: its transmittance is set to 1, because T C fixes only the product."""
-MIN_BRIGHTEST = 0.3
-"""Below this the clearest part of the frame is not clear but hidden, as behind binoculars, and is not rescaled."""
 MIN_OPACITY = 0.1
 """Opacities below this are noise."""
 CERTAIN_OPACITY = 0.3
@@ -123,7 +121,9 @@ def estimate_layers(
         if round_ >= ROUNDS // 2:
             prior = 1 / (PRIOR_SCALE**2 + (layers - expected).square().amax(dim=-1, keepdim=True))
         layers = _solve(sums, across, down, prior, expected, layers)
-        brightest = _quantile(layers[..., 0], 1 - CLEAR_SHARE).clamp_min(MIN_BRIGHTEST)
+        # What hides more than half is not taken for clear, as behind binoculars.
+        clearest = max(1, round((1 - CLEAR_SHARE) * height * width))
+        brightest = layers[..., 0].flatten().kthvalue(clearest).values.clamp_min(0.5)
         layers = torch.cat([layers[..., :1] / brightest, layers[..., 1:]], dim=-1).clamp(0, 1)
         transmitted, added = layers.reshape(-1, 4)[pixel].split((1, 3), dim=-1)
         seen = torch.cat([weight * transmitted * (observed - added), weight * transmitted.square()], dim=-1)
@@ -173,11 +173,6 @@ def _smoothness(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
     change = mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True).square() + SMOOTHNESS_FLOOR**2
     relative = deviation.diff(dim=dimension) / deviation.median().clamp_min(_GRAY_LEVEL)
     return torch.cat([1 / (change + relative.square()), (1 / change).expand(-1, -1, 3)], dim=-1)
-
-
-def _quantile(values: Tensor, share: float) -> Tensor:
-    values = values.flatten()
-    return values.kthvalue(max(1, round(share * values.numel()))).values.clamp_min(1e-3)
 
 
 def _solve(sums: Tensor, across: Tensor, down: Tensor, prior: Tensor, expected: Tensor, layers: Tensor) -> Tensor:
