@@ -46,7 +46,7 @@ DETECTION = {
     ),
     "null_distribution": ("MAX_SHIFT",),
     "static_area": ("MAX_OPAQUE_DEVIATION", "MIN_AREA", "MIN_OUTLINE_SHARE"),
-    "detection": ("SIGNIFICANCE", "MIN_OPAQUE_SHARE"),
+    "detection": ("SIGNIFICANCE",),
 }
 """Constants of the modules in `evidence` that detect, which comes first."""
 ESTIMATE = {

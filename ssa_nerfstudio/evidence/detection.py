@@ -23,8 +23,6 @@ SIGNIFICANCE = 0.01
 """Largest p-value that is reported as an artifact."""
 MIN_VIEWS = 6
 """With fewer views than this, standard errors mean nothing and nothing is reported."""
-MIN_OPAQUE_SHARE = 0.01
-"""Share of the frame that is opaque and enclosed by static edges, from which on the number of edges does not matter."""
 MIN_OPAQUE_COVERAGE = 0.25
 """Share of the artifact's area that has to be opaque for verdict opaque."""
 
@@ -106,7 +104,8 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0, known
     excess = shares[0] - fine, shares[1] - coarse
     interval = clopper_pearson(exceeding, draws)
     enclosed = EnclosedAreas.from_edges(edges.mask, edges.outlines, statistics)
-    few = p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_OPAQUE_SHARE)
+    # What encloses as much of the frame as coarse edges have to cover may be thin.
+    few = p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_EDGE_SHARES[1])
     if few and not (known and edges.mask.any()):
         return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere, nowhere)
     mask = enclosed.mask()

@@ -25,8 +25,9 @@ MIN_GRADIENT = 1 / 255
 """Mean gradients below this (white = 1, per working pixel) never count: codecs and sensors cause them."""
 COARSE_FACTOR = 4
 """Working pixels a side of a pixel of the coarse scale, which shows soft edges (a finger, thick drops)."""
-MIN_EDGE_SHARES = (0.003, 0.015)
-"""Share of static edges above the null's mean, at the fine and the coarse scale, below which nothing is reported."""
+MIN_EDGE_SHARES = (0.003, 0.003 * COARSE_FACTOR)
+"""Share of static edges above the null's mean, at the fine and the coarse scale, below which nothing is reported: a
+line covers COARSE_FACTOR times as much of the coarse frame."""
 DISPLACEMENT_WINDOWS = (21, 11)
 """Side of the window in which a displacement is fitted, pixels of the fine and of the coarse scale; odd."""
 MAX_DISPLACED_SHARES = (0.03, 0.05)
