@@ -45,7 +45,7 @@ DETECTION = {
         "MIN_STILL_SHARE",
     ),
     "null_distribution": ("MAX_SHIFT",),
-    "static_area": ("MAX_OPAQUE_DEVIATION", "MIN_AREA", "MIN_OUTLINE_SHARE"),
+    "static_area": ("MAX_OPAQUE_DEVIATION", "MIN_OUTLINE_SHARE"),
     "detection": ("SIGNIFICANCE",),
 }
 """Constants of the modules in `evidence` that detect, which comes first."""

@@ -9,7 +9,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
+
+_LEAST_VARIANCE = (GRAY_LEVEL / 2) ** 2
 
 
 def displaced_share(images: Tensor, gradient: Tensor, window: int) -> Tensor:
@@ -30,7 +32,7 @@ def displaced_share(images: Tensor, gradient: Tensor, window: int) -> Tensor:
     basis = torch.cat([images.mean(dim=0, keepdim=True), gradient])
     levels = _window_mean(basis, window)
     mean_mean, mean_x, mean_y = _window_mean(basis[:1] * basis, window) - levels[:1] * levels
-    gain = torch.stack([mean_x, mean_y]) / mean_mean.clamp_min(HALF_GRAY_LEVEL**2)
+    gain = torch.stack([mean_x, mean_y]) / mean_mean.clamp_min(_LEAST_VARIANCE)
     xx, yy = _window_mean(gradient.square(), window) - levels[1:].square() - gain * torch.stack([mean_x, mean_y])
     xy = (_window_mean(gradient[:1] * gradient[1:], window) - levels[1:2] * levels[2:])[0] - gain[0] * mean_y
     # A displacement along a straight edge is undetermined: 1 % more variance keeps it near 0 there.
@@ -44,7 +46,7 @@ def displaced_share(images: Tensor, gradient: Tensor, window: int) -> Tensor:
         x, y = torch.stack(with_gradient) - gain * with_mean
         explained += (yy * x.square() - 2 * xy * x * y + xx * y.square()) / determinant
         total += (_window_mean(deviation.square(), window) - level.square())[0]
-    return (explained / total.clamp_min(len(images) * HALF_GRAY_LEVEL**2)).clamp(0, 1)
+    return (explained / total.clamp_min(len(images) * _LEAST_VARIANCE)).clamp(0, 1)
 
 
 def _window_mean(images: Tensor, window: int) -> Tensor:

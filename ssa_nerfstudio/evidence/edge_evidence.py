@@ -17,11 +17,11 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.displacement import displaced_share
-from ssa_nerfstudio.evidence.statistics import ImageStatistics
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 
 EVIDENCE_THRESHOLDS = (6.0, 7.0)
 """Evidence from which on a pixel is a static edge, at the fine and the coarse scale."""
-MIN_GRADIENT = 1 / 255
+MIN_GRADIENT = GRAY_LEVEL
 """Mean gradients below this (white = 1, per working pixel) never count: codecs and sensors cause them."""
 COARSE_FACTOR = 4
 """Working pixels a side of a pixel of the coarse scale, which shows soft edges (a finger, thick drops)."""

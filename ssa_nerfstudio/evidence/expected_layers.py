@@ -10,10 +10,10 @@ from torch import Tensor, nn
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, calm_areas
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 DETAIL_RADIUS = 4
 """Working pixels: differences from means over windows of this radius are details, and not the scene's."""
-_GRAY_LEVEL = 1 / 255
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
@@ -83,7 +83,7 @@ def _hardly_varying(samples: PointSamples, clear: Tensor, constant: Tensor, devi
     for area in areas:
         calm[area] = 1
     # A gray level, because photos are rounded.
-    values = torch.stack([constant, clear], dim=1).abs().mean(dim=-1) + _GRAY_LEVEL
+    values = torch.stack([constant, clear], dim=1).abs().mean(dim=-1) + GRAY_LEVEL
     values = values * calm[samples.pixel]
     around = local_mean(summed(samples.pixel, values, height * width).reshape(height, width, 2), DETAIL_RADIUS)
     varying, missing = around.reshape(-1, 2).unbind(dim=-1)

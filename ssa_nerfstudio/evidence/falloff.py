@@ -15,13 +15,13 @@ from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
 from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE
 from ssa_nerfstudio.evidence.photo_exposure import DAMPING, MIN_SCALE, OUTLIER_SCALE, ROUNDS, USABLE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 MAX_SAMPLES = 20_000
 """Of more, those of a regular subset of the points are used: a falloff has five parameters."""
 MAX_VIEWS = 128
 """Of more, a regular subset is used."""
 RADIAL_MODES = 5
-_GRAY_LEVEL = 1 / 255
 
 
 @torch.no_grad()
@@ -49,7 +49,7 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
         # What is darkest in the middle is in front of the lens.
         return samples.color.new_ones(height, width, 1)
     clear = log_transmittance[log_transmittance >= clearest].mean()
-    return (log_transmittance - clear).exp().clamp(_GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+    return (log_transmittance - clear).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
 def _chance(squares: Tensor, first: int) -> float:
@@ -82,7 +82,7 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
     known, point = samples.point[usable].unique(return_inverse=True)
     shown_by = torch.nn.functional.one_hot(samples.view[usable] // every)
     columns = torch.cat([modes[samples.pixel[usable]], shown_by.to(modes)], dim=-1)
-    values = brightness[usable].clamp_min(_GRAY_LEVEL).log()[:, None]
+    values = brightness[usable].clamp_min(GRAY_LEVEL).log()[:, None]
     # The modes only need to be regular.
     damping = torch.full(columns.shape[1:], DAMPING, dtype=columns.dtype, device=columns.device)
     damping[: modes.shape[1]] = 1e-9

@@ -19,8 +19,7 @@ from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
 from ssa_nerfstudio.evidence.layer_estimate import CERTAIN_OPACITY, MIN_OPACITY, LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
-from ssa_nerfstudio.evidence.static_area import HALF_GRAY_LEVEL
-from ssa_nerfstudio.evidence.statistics import ImageStatistics
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 from ssa_nerfstudio.overlay.layer import CONSTANT_INITIALIZATION, INITIAL_MATTE_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
@@ -62,7 +61,7 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tenso
     """
     reduction = working_reduction(*guide.shape[:2])
     # Photos that vary nowhere show no scene.
-    hidden = opaque.to(guide.device) | (guide[..., 3] < HALF_GRAY_LEVEL).all()
+    hidden = opaque.to(guide.device) | (guide[..., 3] < GRAY_LEVEL / 2).all()
     areas = torch.stack([hidden, static.to(guide.device)], dim=-1).to(guide)
     photos = reduced(torch.cat([guide, areas], dim=-1), reduction).to(samples.color.device)
     falloff = estimate_falloff(samples)

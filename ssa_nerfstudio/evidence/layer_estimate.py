@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 ROUNDS = 8
@@ -34,7 +35,6 @@ CERTAIN_OPACITY = 0.3
 """Opacities above this are rarely noise: at most 1.2 % of the frame of three clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges."""
-_GRAY_LEVEL = 1 / 255
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def estimate_layers(
     seen_by = torch.bincount(point, minlength=samples.points)[point]
     uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
     for round_ in range(ROUNDS):
-        scale = 1.48 * residual.abs().median() + _GRAY_LEVEL
+        scale = 1.48 * residual.abs().median() + GRAY_LEVEL
         weight = 1 / (1 + residual.square().mean(dim=-1, keepdim=True) / (OUTLIER_SCALE * scale) ** 2)
         behind = colors[point]
         precision = weight / (scale**2 * (1 + uncertainty))
@@ -171,7 +171,7 @@ def _initial_colors(samples: PointSamples, deviation: Tensor) -> Tensor:
 def _smoothness(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
     """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension."""
     change = mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True).square() + SMOOTHNESS_FLOOR**2
-    relative = deviation.diff(dim=dimension) / deviation.median().clamp_min(_GRAY_LEVEL)
+    relative = deviation.diff(dim=dimension) / deviation.median().clamp_min(GRAY_LEVEL)
     return torch.cat([1 / (change + relative.square()), (1 / change).expand(-1, -1, 3)], dim=-1)
 
 

@@ -10,20 +10,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
-from ssa_nerfstudio.evidence.statistics import ImageStatistics
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 
 MAX_OPAQUE_DEVIATION = 0.2
 """Deviation relative to the capture's (its 75th percentile) below which an opaque artifact may cover a pixel, and of an
 area relative to what surrounds it. On three captures dashboards and buttons have 0.01 to 0.07 of their surroundings,
 paths and skies between drops at least 0.45."""
-HALF_GRAY_LEVEL = 0.5 / 255
-"""Deviations below this are low in any capture."""
-MIN_AREA = 16
-"""Working pixels; smaller areas are ignored."""
+MIN_AREA = COARSE_FACTOR**2
+"""Working pixels; smaller areas than a pixel of the coarse scale are ignored."""
 MIN_OUTLINE_SHARE = 0.5
 """Share of an area's outline that has to be static edges: a uniform artifact has them, a uniform sky does not."""
-_GRAY_LEVEL = 1 / 255
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
@@ -77,7 +75,7 @@ class EnclosedAreas:
         deviation does not rise.
         """
         areas = cv2.morphologyEx(self._hiding, cv2.MORPH_CLOSE, _NEIGHBORS)
-        level = self.deviation + _GRAY_LEVEL
+        level = self.deviation + GRAY_LEVEL
         kept = np.zeros_like(areas)
         for box, area in _connected_areas(areas, margin=4):
             outside = cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS)
@@ -97,7 +95,7 @@ class EnclosedAreas:
 
 def low_deviation(deviation: np.ndarray) -> np.ndarray:
     """Where views vary so little that an opaque artifact may cover the pixel: bool, given the deviation [h, w]."""
-    return deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), HALF_GRAY_LEVEL)
+    return deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), GRAY_LEVEL / 2)
 
 
 def calm_areas(deviation: np.ndarray) -> list[np.ndarray]:

@@ -9,6 +9,8 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.brightness import BrightnessBlocks
 
+GRAY_LEVEL = 1 / 255
+"""Step of 8 bits, by which photos are rounded (white = 1). Less than half of it is no difference."""
 _FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
 _MAX_VIEWS_IN_INT32 = 33_000
 """So many squares of uint8 add up to less than 2^31."""
