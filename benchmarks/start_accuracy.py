@@ -45,7 +45,7 @@ DETECTION = {
         "MIN_STILL_SHARE",
     ),
     "null_distribution": ("MAX_SHIFT",),
-    "static_area": ("MAX_OPAQUE_DEVIATION", "MIN_OUTLINE_SHARE"),
+    "static_area": ("MAX_OPAQUE_DEVIATION",),
     "detection": ("SIGNIFICANCE",),
 }
 """Constants of the modules in `evidence` that detect, which comes first."""
@@ -59,8 +59,6 @@ ESTIMATE = {
         "SMOOTHNESS_FLOOR",
         "OUTLIER_SCALE",
         "CLEAR_SHARE",
-        "MIN_OPACITY",
-        "CERTAIN_OPACITY",
     ),
     "guided_upsampling": ("RADIUS", "NOISE"),
 }

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
-from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
+from ssa_nerfstudio.evidence.point_samples import OCCLUSION_RADIUS, PointSamples, summed
 from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, calm_areas
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
-DETAIL_RADIUS = 4
-"""Working pixels: differences from means over windows of this radius are details, and not the scene's."""
+DETAIL_RADIUS = 2 * OCCLUSION_RADIUS
+"""Working pixels: the samples of a window of this radius are compared together."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
-from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
+from ssa_nerfstudio.evidence.point_samples import OCCLUSION_RADIUS, PointSamples, summed
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
@@ -29,10 +30,11 @@ OUTLIER_SCALE = 3.0
 """Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden."""
 CLEAR_SHARE = 0.2
 """Share of the frame that is taken for clear: its transmittance is set to 1, because T C fixes only the product."""
-MIN_OPACITY = 0.1
+MIN_OPACITY = 2 * PRIOR_SCALE
 """Opacities below this are noise."""
-CERTAIN_OPACITY = 0.3
-"""Opacities above this are rarely noise: at most 1.2 % of the frame of three clean captures."""
+CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
+"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.2 % of the frame of three
+clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges."""
 
@@ -135,7 +137,7 @@ def estimate_layers(
         residual = observed - transmitted * colors[point] - added
     outliers = residual.square().mean(dim=-1, keepdim=True) > (OUTLIER_SCALE * scale) ** 2
     counts = torch.cat([outliers.to(residual), torch.ones_like(residual[:, :1])], dim=-1)
-    around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), DETAIL_RADIUS // 2)
+    around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), OCCLUSION_RADIUS)
     unexplained = around[..., :1] / around[..., 1:].clamp_min(1e-9)
     return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained)
 

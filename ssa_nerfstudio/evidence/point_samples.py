@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.evidence import brightness
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 
-WORKING_SIZE = 240
-"""Photos are reduced by the integer that brings their longer side nearest to this, pixels."""
+WORKING_SIZE = brightness.WORKING_SIZE // 2
+"""Photos are reduced by the integer that brings their longer side nearest to this, pixels: half of detection's."""
 OCCLUSION_TOLERANCE = 0.05
 """A point is hidden where another one within OCCLUSION_RADIUS is nearer by more than this share of its depth."""
 OCCLUSION_RADIUS = 2

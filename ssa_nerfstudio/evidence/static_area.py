@@ -20,8 +20,6 @@ area relative to what surrounds it. On three captures dashboards and buttons hav
 paths and skies between drops at least 0.45."""
 MIN_AREA = COARSE_FACTOR**2
 """Working pixels; smaller areas than a pixel of the coarse scale are ignored."""
-MIN_OUTLINE_SHARE = 0.5
-"""Share of an area's outline that has to be static edges: a uniform artifact has them, a uniform sky does not."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
@@ -107,11 +105,14 @@ def calm_areas(deviation: np.ndarray) -> list[np.ndarray]:
 
 
 def _with_edge_outline(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """The connected areas of whose outline at least MIN_OUTLINE_SHARE is edges: uint8 [h, w]."""
+    """The connected areas of whose outline at least half is edges: uint8 [h, w].
+
+    A uniform artifact has them, a uniform sky does not.
+    """
     kept = np.zeros_like(areas)
     for box, inside in _connected_areas(areas, margin=1):
         outline = cv2.dilate(inside, _NEIGHBORS) > inside
-        if not outline.any() or edges[box][outline].mean() >= MIN_OUTLINE_SHARE:
+        if not outline.any() or edges[box][outline].mean() >= 0.5:
             kept[box] |= inside
     return kept
 
