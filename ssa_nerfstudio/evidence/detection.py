@@ -5,7 +5,7 @@ docs/detect.md derives it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import MIN_EDGE_SHARES, measure_edges
 from ssa_nerfstudio.evidence.null_distribution import clopper_pearson, null_shares
-from ssa_nerfstudio.evidence.static_area import EnclosedAreas
+from ssa_nerfstudio.evidence.static_area import artifact_area
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 DRAWS = 200
@@ -95,25 +95,22 @@ def detect(statistics: ImageStatistics, draws: int = DRAWS, seed: int = 0, known
     edges = measure_edges(statistics)
     shares, evidence = edges.shares, edges.fields[0] * edges.still[0]
     nowhere = torch.zeros(statistics.size, dtype=torch.bool)
+    untested = Detection("none", 0.0, 1.0, (0.0, 1.0), views, shares, (0.0, 0.0), evidence, nowhere, nowhere)
     if views < MIN_VIEWS:
-        return Detection("none", 0.0, 1.0, (0.0, 1.0), views, shares, (0.0, 0.0), evidence, nowhere, nowhere)
+        return untested
     null = list(null_shares(edges, draws, np.random.default_rng(seed)))
     exceeding = sum(_strength(draw) >= _strength(shares) for draw in null)
-    p_value = (1 + exceeding) / (1 + draws)
+    p_value, p_interval = (1 + exceeding) / (1 + draws), clopper_pearson(exceeding, draws)
     fine, coarse = (float(np.mean(scale)) for scale in zip(*null, strict=True))
-    excess = shares[0] - fine, shares[1] - coarse
-    interval = clopper_pearson(exceeding, draws)
-    enclosed = EnclosedAreas.from_edges(edges.mask, edges.outlines, statistics)
+    tested = replace(untested, p_value=p_value, p_interval=p_interval, null_shares=(fine, coarse))
+    area = artifact_area(edges, statistics)
     # What encloses as much of the frame as coarse edges have to cover may be thin.
-    few = p_value > SIGNIFICANCE or (_strength(excess) < 1 and enclosed.opaque_share < MIN_EDGE_SHARES[1])
-    if few and not (known and edges.mask.any()):
-        return Detection("none", 0.0, p_value, interval, views, shares, (fine, coarse), evidence, nowhere, nowhere)
-    mask = enclosed.mask()
-    coverage = float(mask.float().mean())
-    verdict = "opaque" if enclosed.opaque_share >= MIN_OPAQUE_COVERAGE * coverage else "faint"
-    return Detection(
-        verdict, coverage, p_value, interval, views, shares, (fine, coarse), evidence, mask, enclosed.opaque()
-    )
+    many = _strength((shares[0] - fine, shares[1] - coarse)) >= 1 or area.opaque_share >= MIN_EDGE_SHARES[1]
+    if not (p_value <= SIGNIFICANCE and many) and not (known and edges.mask.any()):
+        return tested
+    coverage = float(area.mask.float().mean())
+    verdict = "opaque" if area.opaque_share >= MIN_OPAQUE_COVERAGE * coverage else "faint"
+    return replace(tested, verdict=verdict, coverage=coverage, mask=area.mask, opaque=area.opaque)
 
 
 def _strength(shares: tuple[float, ...]) -> float:

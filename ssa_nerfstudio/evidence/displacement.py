@@ -7,8 +7,9 @@ Source: Lucas and Kanade 1981, with exposure as two more unknowns (docs/detect.m
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
+from ssa_nerfstudio.evidence.guided_upsampling import window_mean
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 _LEAST_VARIANCE = (GRAY_LEVEL / 2) ** 2
@@ -30,28 +31,20 @@ def displaced_share(images: Tensor, gradient: Tensor, window: int) -> Tensor:
         [h, w] in [0, 1].
     """
     basis = torch.cat([images.mean(dim=0, keepdim=True), gradient])
-    levels = _window_mean(basis, window)
-    mean_mean, mean_x, mean_y = _window_mean(basis[:1] * basis, window) - levels[:1] * levels
+    levels = window_mean(basis, window)
+    mean_mean, mean_x, mean_y = window_mean(basis[:1] * basis, window) - levels[:1] * levels
     gain = torch.stack([mean_x, mean_y]) / mean_mean.clamp_min(_LEAST_VARIANCE)
-    xx, yy = _window_mean(gradient.square(), window) - levels[1:].square() - gain * torch.stack([mean_x, mean_y])
-    xy = (_window_mean(gradient[:1] * gradient[1:], window) - levels[1:2] * levels[2:])[0] - gain[0] * mean_y
+    xx, yy = window_mean(gradient.square(), window) - levels[1:].square() - gain * torch.stack([mean_x, mean_y])
+    xy = (window_mean(gradient[:1] * gradient[1:], window) - levels[1:2] * levels[2:])[0] - gain[0] * mean_y
     # A displacement along a straight edge is undetermined: 1 % more variance keeps it near 0 there.
     ridge = 0.01 * (xx + yy).clamp_min(torch.finfo(images.dtype).eps)
     xx, yy = xx + ridge, yy + ridge
     determinant = (xx * yy - xy.square()).clamp_min(ridge.square())
     explained, total = torch.zeros_like(images[0]), torch.zeros_like(images[0])
     for deviation in (images - basis[0])[:, None]:
-        level = _window_mean(deviation, window)
-        with_mean, *with_gradient = _window_mean(basis * deviation, window) - levels * level
+        level = window_mean(deviation, window)
+        with_mean, *with_gradient = window_mean(basis * deviation, window) - levels * level
         x, y = torch.stack(with_gradient) - gain * with_mean
         explained += (yy * x.square() - 2 * xy * x * y + xx * y.square()) / determinant
-        total += (_window_mean(deviation.square(), window) - level.square())[0]
+        total += (window_mean(deviation.square(), window) - level.square())[0]
     return (explained / total.clamp_min(len(images) * _LEAST_VARIANCE)).clamp(0, 1)
-
-
-def _window_mean(images: Tensor, window: int) -> Tensor:
-    """Means over windows of this odd side, [n, h, w]; at the border over the part inside."""
-    for sides in ((window, 1), (1, window)):
-        margins = sides[0] // 2, sides[1] // 2
-        images = nn.functional.avg_pool2d(images, sides, stride=1, padding=margins, count_include_pad=False)
-    return images

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.point_samples import OCCLUSION_RADIUS, PointSamples, summed
-from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, calm_areas
+from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, MIN_AREA, connected_parts, low_deviation
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 DETAIL_RADIUS = 2 * OCCLUSION_RADIUS
 """Working pixels: the samples of a window of this radius are compared together."""
-_NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
 def expected_layers(
@@ -47,9 +44,9 @@ def _of_static_parts(samples: PointSamples, colors: Tensor, constant: Tensor, me
     """
     height, width = samples.size
     # Closed: a textured artifact has pixels without an edge.
-    area = cv2.morphologyEx((static[..., 0] > 0.5).cpu().numpy().astype(np.uint8), cv2.MORPH_CLOSE, _NEIGHBORS)
-    count, labels = cv2.connectedComponents(area, connectivity=8)
-    part = torch.from_numpy(labels).to(static.device, torch.int64).flatten()
+    wider = nn.functional.max_pool2d((static[None, ..., 0] > 0.5).float(), 3, 1, 1)
+    part = connected_parts(-nn.functional.max_pool2d(-wider, 3, 1, 1)[0]).flatten()
+    count = int(part.max()) + 1
     of_sample = part[samples.pixel]
     seen = torch.cat([colors, torch.ones_like(colors[:, :1])], dim=-1)
     around = local_mean(summed(samples.pixel, seen, height * width).reshape(height, width, 4), DETAIL_RADIUS)
@@ -78,20 +75,18 @@ def _hardly_varying(samples: PointSamples, clear: Tensor, constant: Tensor, devi
     and an area's the mean over its pixels: otherwise many points behind a button would speak for a path beside it.
     """
     height, width = samples.size
-    areas = [torch.from_numpy(area).to(samples.pixel.device) for area in calm_areas(deviation[..., 0].cpu().numpy())]
-    calm = samples.color.new_zeros(height * width, 1)
-    for area in areas:
-        calm[area] = 1
+    low = torch.from_numpy(low_deviation(deviation[..., 0].cpu().numpy())).to(deviation.device)
+    area = connected_parts(low, connectivity=4).flatten()
+    size = torch.bincount(area)
+    area = torch.where(size[area] < MIN_AREA, 0, area)
     # A gray level, because photos are rounded.
     values = torch.stack([constant, clear], dim=1).abs().mean(dim=-1) + GRAY_LEVEL
-    values = values * calm[samples.pixel]
+    values = values * (area[samples.pixel] > 0)[:, None]
     around = local_mean(summed(samples.pixel, values, height * width).reshape(height, width, 2), DETAIL_RADIUS)
-    varying, missing = around.reshape(-1, 2).unbind(dim=-1)
+    varying, missing = around.reshape(-1, 2).split(1, dim=-1)
+    known = (missing > 1e-9).to(missing)
     ratio = (varying / missing.clamp_min(1e-12)).clamp_max(1)
-    known = missing > 1e-9
-    found = torch.zeros(height * width, 1, dtype=torch.bool, device=ratio.device)
-    for area in areas:
-        told = ratio[area][known[area]]
-        if len(told) and told.mean() <= MAX_OPAQUE_DEVIATION:
-            found[area] = True
-    return found.reshape(height, width, 1)
+    total, count = summed(area, torch.cat([known * ratio, known], dim=-1), len(size)).split(1, dim=-1)
+    hiding = (count > 0) & (total <= MAX_OPAQUE_DEVIATION * count)
+    hiding[0] = False
+    return hiding[area].reshape(height, width, 1)

@@ -45,10 +45,16 @@ def upsample(layers: Tensor, guide: Tensor, reduction: int) -> Tensor:
 
 def local_mean(values: Tensor, radius: int) -> Tensor:
     """Means [h, w, ...] over square windows of a radius in pixels, cut off at the frame."""
-    planes = values.flatten(2).permute(2, 0, 1)[None]
-    side = 2 * radius + 1
-    means = nn.functional.avg_pool2d(planes, side, stride=1, padding=radius, count_include_pad=False)
-    return means[0].permute(1, 2, 0).reshape(values.shape)
+    means = window_mean(values.flatten(2).permute(2, 0, 1), 2 * radius + 1)
+    return means.permute(1, 2, 0).reshape(values.shape)
+
+
+def window_mean(images: Tensor, side: int) -> Tensor:
+    """Means of images [n, h, w] over square windows of this odd side in pixels, cut off at the frame."""
+    for sides in ((side, 1), (1, side)):
+        margins = sides[0] // 2, sides[1] // 2
+        images = nn.functional.avg_pool2d(images, sides, stride=1, padding=margins, count_include_pad=False)
+    return images
 
 
 def enlarged(values: Tensor, height: int, width: int, reduction: int) -> Tensor:

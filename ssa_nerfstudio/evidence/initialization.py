@@ -8,17 +8,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.changing_area import changing_area
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
-from ssa_nerfstudio.evidence.guided_upsampling import enlarged, reduced, upsample
+from ssa_nerfstudio.evidence.guided_upsampling import enlarged, local_mean, reduced, upsample
 from ssa_nerfstudio.evidence.layer_estimate import CERTAIN_OPACITY, MIN_OPACITY, LayerEstimate, estimate_layers
-from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
+from ssa_nerfstudio.evidence.point_samples import PointSamples, summed, working_reduction
+from ssa_nerfstudio.evidence.static_area import connected_parts
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 from ssa_nerfstudio.overlay.layer import CONSTANT_INITIALIZATION, INITIAL_MATTE_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import smallest_matte
@@ -148,12 +147,11 @@ def _present(opacity: Tensor, static: Tensor | None, reduction: int) -> Tensor:
         static: [H, W] bool, of the photos' size; None: nowhere.
         reduction: photo pixels a working pixel.
     """
-    count, labels = cv2.connectedComponents((opacity[..., 0] > MIN_OPACITY).cpu().numpy().astype(np.uint8))
-    area = torch.from_numpy(labels).to(opacity.device, torch.int64)[..., None]
+    area = connected_parts(opacity[..., 0] > MIN_OPACITY)[..., None]
     sure = opacity > CERTAIN_OPACITY
     if static is not None:
         sure |= reduced(static.to(opacity)[..., None], reduction) > 0
-    kept = torch.zeros(count, device=opacity.device)
+    kept = opacity.new_zeros(int(area.max()) + 1)
     kept[area[sure]] = 1
     kept[0] = 0
     # A pixel wider, for the soft rim.
@@ -184,21 +182,20 @@ def _likely_colors(layers: Tensor, static: Tensor, mean: Tensor, reduction: int)
     overall = _mean_color(layers)
     if not static.any():
         return overall.expand_as(mean)
-    found = static.cpu().numpy()
-    labels = torch.from_numpy(cv2.connectedComponents(found.astype(np.uint8))[1]).to(mean.device)
-    outside = 1 - found[..., None].astype(np.float32)
-    side = (2 * DETAIL_RADIUS + 1) * reduction
-    sums = cv2.blur(np.concatenate([mean.cpu().numpy() * outside, outside], axis=-1), (side, side))
-    around, seen = torch.from_numpy(sums).to(mean).split((3, 1), dim=-1)
+    static = static.to(mean.device)
+    outside = 1 - static[..., None].to(mean)
+    sums = local_mean(torch.cat([mean * outside, outside], dim=-1), DETAIL_RADIUS * reduction)
+    around, seen = sums.split((3, 1), dim=-1)
     around = torch.where(seen > 1e-6, around / seen.clamp_min(1e-6), mean)
     agreement = ((mean - around) * (overall - around)).sum(dim=-1, keepdim=True)
     transmittance, addition = layers.split((1, 3), dim=-1)
     values = torch.cat([smallest_matte(transmittance, addition), addition, agreement], dim=-1).reshape(-1, 5)
-    parts = values.new_zeros(int(labels.max()) + 1, 5).index_add_(0, labels.flatten(), values)
+    labels = connected_parts(static)
+    parts = summed(labels.flatten(), values, int(labels.max()) + 1)
     matte, color, agreement = parts[labels].split((1, 3, 1), dim=-1)
     missed = torch.where(agreement < 0, mean, overall.expand_as(mean))
     own = torch.where(matte > 0, color / matte.clamp_min(1e-6), missed)
-    return torch.where(static.to(mean.device)[..., None], own, overall)
+    return torch.where(static[..., None], own, overall)
 
 
 def _papers_matte(statistics: ImageStatistics, within: Tensor | None) -> Tensor:

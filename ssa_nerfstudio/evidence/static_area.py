@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR
+from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 
@@ -21,74 +21,43 @@ paths and skies between drops at least 0.45."""
 MIN_AREA = COARSE_FACTOR**2
 """Working pixels; smaller areas than a pixel of the coarse scale are ignored."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
+_MARGIN = 4
 
 
 @dataclass(frozen=True)
-class EnclosedAreas:
-    """Areas of low deviation that static edges enclose, at the working resolution."""
+class ArtifactArea:
+    """Where static edges are, and what they enclose."""
 
-    statistics: ImageStatistics
-    """Of the views."""
-    edges: np.ndarray
-    """Static edges, uint8 [h, w]."""
-    deviation: np.ndarray
-    """Of the views, [h, w]."""
-    low: np.ndarray
-    """bool [h, w]: where the deviation is low enough for an opaque artifact."""
-    enclosed: np.ndarray
-    """uint8 [h, w]: areas of low deviation whose outline is static edges."""
+    mask: Tensor
+    """[H, W] bool: edges, widened by a working pixel, and the areas of low deviation that they enclose."""
+    opaque: Tensor
+    """[H, W] bool: the areas that hide the scene, because the deviation rises abruptly at their outline."""
+    opaque_share: float
+    """Share of the frame that may be opaque: edges of low deviation and what they enclose."""
 
-    @classmethod
-    def from_edges(cls, edges: np.ndarray, outlines: np.ndarray, statistics: ImageStatistics) -> EnclosedAreas:
-        """Find the areas that edges enclose.
 
-        Args:
-            edges: static edges, uint8 [h, w].
-            outlines: edges and what continues them, likewise.
-            statistics: of the views.
-        """
-        deviation = reduced(statistics.deviation().float(), statistics.brightness.reduction)[..., 0].cpu().numpy()
-        low = low_deviation(deviation)
-        enclosed = _with_edge_outline(low.astype(np.uint8), cv2.dilate(outlines, _NEIGHBORS, iterations=2))
-        return cls(statistics, edges, deviation, low, enclosed)
+def artifact_area(edges: EdgeEvidence, statistics: ImageStatistics) -> ArtifactArea:
+    """Find the area of static edges and the areas that they enclose.
 
-    @property
-    def opaque_share(self) -> float:
-        """Share of the frame that may be opaque."""
-        return float(self._hiding.mean())
-
-    @property
-    def _hiding(self) -> np.ndarray:
-        """uint8 [h, w]: enclosed areas, and edges of low deviation."""
-        return self.enclosed | (self.edges & self.low)
-
-    def mask(self) -> Tensor:
-        """[H, W] bool: edges, widened by a pixel, and the areas that they enclose."""
-        return self._at_full_size(cv2.dilate(self.edges, _NEIGHBORS) | self.enclosed)
-
-    def opaque(self) -> Tensor:
-        """[H, W] bool: the areas that hide the scene, because the deviation rises abruptly at their outline.
-
-        A path between drops of mud is an area of low deviation among static edges, too, but at its end, a drop, the
-        deviation does not rise.
-        """
-        areas = cv2.morphologyEx(self._hiding, cv2.MORPH_CLOSE, _NEIGHBORS)
-        level = self.deviation + GRAY_LEVEL
-        kept = np.zeros_like(areas)
-        for box, area in _connected_areas(areas, margin=4):
-            outside = cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS)
-            within = area > cv2.erode(area, _NEIGHBORS, iterations=2)
-            unbounded = not outside.any() or not within.any()
-            if unbounded or np.median(level[box][within]) <= MAX_OPAQUE_DEVIATION * np.median(level[box][outside]):
-                kept[box] |= area
-        return self._at_full_size(kept)
-
-    def _at_full_size(self, layer: np.ndarray) -> Tensor:
-        height, width = self.statistics.size
-        reduction = self.statistics.brightness.reduction
-        enlarged = cv2.resize(layer, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_NEAREST)
-        missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]))
-        return torch.from_numpy(np.pad(enlarged, missing, mode="edge") > 0)
+    Args:
+        edges: of the views.
+        statistics: likewise.
+    """
+    reduction = statistics.brightness.reduction
+    deviation = reduced(statistics.deviation().float(), reduction)[..., 0].cpu().numpy()
+    low = low_deviation(deviation).astype(np.uint8)
+    outlines = cv2.dilate(edges.outlines, _NEIGHBORS, iterations=2)
+    enclosed = _areas_where(low, lambda box, area: _has_outline(outlines[box], area))
+    hiding = enclosed | (edges.mask & low)
+    level = deviation + GRAY_LEVEL
+    closed = cv2.morphologyEx(hiding, cv2.MORPH_CLOSE, _NEIGHBORS)
+    opaque = _areas_where(closed, lambda box, area: _ends_abruptly(level[box], area))
+    layers = np.stack([cv2.dilate(edges.mask, _NEIGHBORS) | enclosed, opaque], axis=-1).astype(np.uint8)
+    enlarged = cv2.resize(layers, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_NEAREST)
+    height, width = statistics.size
+    missing = ((0, height - enlarged.shape[0]), (0, width - enlarged.shape[1]), (0, 0))
+    mask, hidden = torch.from_numpy(np.pad(enlarged, missing, mode="edge") > 0).unbind(dim=-1)
+    return ArtifactArea(mask, hidden, float(hiding.mean()))
 
 
 def low_deviation(deviation: np.ndarray) -> np.ndarray:
@@ -96,32 +65,38 @@ def low_deviation(deviation: np.ndarray) -> np.ndarray:
     return deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), GRAY_LEVEL / 2)
 
 
-def calm_areas(deviation: np.ndarray) -> list[np.ndarray]:
-    """Connected areas of `low_deviation`, of at least MIN_AREA: flat indices of each one's pixels."""
-    count, labels = cv2.connectedComponents(low_deviation(deviation).astype(np.uint8), connectivity=4)
-    order = np.argsort(labels, axis=None, kind="stable")
-    areas = np.split(order, np.searchsorted(labels.ravel()[order], np.arange(1, count)))[1:]
-    return [area for area in areas if len(area) >= MIN_AREA]
+def connected_parts(area: Tensor, connectivity: int = 8) -> Tensor:
+    """Number the connected parts of an area, bool [h, w], from 1: int64 [h, w], 0 elsewhere."""
+    labels = cv2.connectedComponents(area.to("cpu", torch.uint8).numpy(), connectivity=connectivity)[1]
+    return torch.from_numpy(labels).to(area.device, torch.int64)
 
 
-def _with_edge_outline(areas: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """The connected areas of whose outline at least half is edges: uint8 [h, w].
+def _has_outline(outlines: np.ndarray, area: np.ndarray) -> bool:
+    """Whether at least half of an area's outline is edges: a uniform artifact has them, a uniform sky does not."""
+    around = cv2.dilate(area, _NEIGHBORS) > area
+    return not around.any() or outlines[around].mean() >= 0.5
 
-    A uniform artifact has them, a uniform sky does not.
+
+def _ends_abruptly(level: np.ndarray, area: np.ndarray) -> bool:
+    """Whether the deviation rises abruptly at an area's outline.
+
+    A path between drops of mud is an area of low deviation among static edges, too, but at its end, a drop, the
+    deviation does not rise.
     """
-    kept = np.zeros_like(areas)
-    for box, inside in _connected_areas(areas, margin=1):
-        outline = cv2.dilate(inside, _NEIGHBORS) > inside
-        if not outline.any() or edges[box][outline].mean() >= 0.5:
-            kept[box] |= inside
-    return kept
+    outside = cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS)
+    within = area > cv2.erode(area, _NEIGHBORS, iterations=2)
+    unbounded = not outside.any() or not within.any()
+    return bool(unbounded or np.median(level[within]) <= MAX_OPAQUE_DEVIATION * np.median(level[outside]))
 
 
-def _connected_areas(areas: np.ndarray, margin: int) -> Iterator[tuple[tuple[slice, slice], np.ndarray]]:
-    """Yield the connected areas of at least MIN_AREA: the box around one, with a margin in pixels, and it."""
+def _areas_where(areas: np.ndarray, kept: Callable[[tuple[slice, slice], np.ndarray], bool]) -> np.ndarray:
+    """The connected areas of at least MIN_AREA, uint8 [h, w], for which a function of the box around one is true."""
     count, labels, boxes, _ = cv2.connectedComponentsWithStats(areas, connectivity=4)
+    found = np.zeros_like(areas)
     for label in range(1, count):
         x, y, w, h, size = boxes[label]
-        if size >= MIN_AREA:
-            box = slice(max(0, y - margin), y + h + margin), slice(max(0, x - margin), x + w + margin)
-            yield box, (labels[box] == label).astype(np.uint8)
+        box = slice(max(0, y - _MARGIN), y + h + _MARGIN), slice(max(0, x - _MARGIN), x + w + _MARGIN)
+        area = (labels[box] == label).astype(np.uint8)
+        if size >= MIN_AREA and kept(box, area):
+            found[box] |= area
+    return found
