@@ -46,7 +46,7 @@ DETECTION = {
     ),
     "null_distribution": ("MAX_SHIFT",),
     "static_area": ("MAX_OPAQUE_DEVIATION",),
-    "detection": ("SIGNIFICANCE",),
+    "detection": ("SIGNIFICANCE", "MIN_OPAQUE_COVERAGE"),
 }
 """Constants of the modules in `evidence` that detect, which comes first."""
 ESTIMATE = {
@@ -60,7 +60,7 @@ ESTIMATE = {
         "OUTLIER_SCALE",
         "CLEAR_SHARE",
     ),
-    "guided_upsampling": ("RADIUS", "NOISE"),
+    "guided_upsampling": ("RADIUS",),
 }
 """Those of the modules that estimate the layers."""
 

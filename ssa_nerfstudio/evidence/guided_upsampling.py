@@ -8,10 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
+
 RADIUS = 2
 """Working pixels: the layers are a linear function of the guide within windows of this radius."""
-NOISE = 0.01
-"""Standard deviation of the guide that carries no information about the layers."""
 
 
 def reduced(image: Tensor, reduction: int) -> Tensor:
@@ -36,7 +36,8 @@ def upsample(layers: Tensor, guide: Tensor, reduction: int) -> Tensor:
     mean, target = local_mean(low, RADIUS), local_mean(layers, RADIUS)
     covariance = local_mean(low[..., :, None] * low[..., None, :], RADIUS) - mean[..., :, None] * mean[..., None, :]
     joint = local_mean(low[..., :, None] * layers[..., None, :], RADIUS) - mean[..., :, None] * target[..., None, :]
-    slope = torch.linalg.solve(covariance + NOISE**2 * torch.eye(guide.shape[2]).to(guide), joint)
+    # Differences of a gray level say nothing about the layers.
+    slope = torch.linalg.solve(covariance + GRAY_LEVEL**2 * torch.eye(guide.shape[2]).to(guide), joint)
     offset = target - (mean[..., None, :] @ slope)[..., 0, :]
     size = guide.shape[0], guide.shape[1], reduction
     slope, offset = enlarged(local_mean(slope, RADIUS), *size), enlarged(local_mean(offset, RADIUS), *size)
