@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 Function = Callable[..., tuple[Tensor, ...]]
@@ -267,24 +267,6 @@ class RecordedChanges:
             if len(self._known) > self._limit:
                 del self._known[next(iter(self._known))]
         (repeat or program)()
-
-
-@contextmanager
-def parameters_replaced(module: nn.Module, tensors: Sequence[Tensor]) -> Iterator[None]:
-    """Let a module compute with other tensors in place of its parameters, in the order of `parameters()`.
-
-    As there, a parameter that is None is left out, and one that has several places counts once.
-    """
-    places = [(each, name) for each in module.modules() for name in each._parameters]
-    held = [each._parameters[name] for each, name in places]
-    other = {id(mine): given for mine, given in zip(module.parameters(), tensors, strict=True)}
-    for (each, name), parameter in zip(places, held, strict=True):
-        each._parameters[name] = other.get(id(parameter))  # pyright: ignore[reportArgumentType]
-    try:
-        yield
-    finally:
-        for (each, name), parameter in zip(places, held, strict=True):
-            each._parameters[name] = parameter
 
 
 def _warn(error: RuntimeError) -> None:

@@ -8,7 +8,8 @@ import torch
 from nerfstudio.models.splatfacto import SplatfactoModel
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable, parameters_replaced
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable
+from ssa_nerfstudio._system.parameter_replacement import parameters_replaced
 from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts

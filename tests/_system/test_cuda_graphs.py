@@ -5,13 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 from recordings import CUDA, recorder, run_again
-from torch import Tensor, nn
+from torch import Tensor
 
 from ssa_nerfstudio._system.cuda_graphs import (
     CapturedPrograms,
     RecordedCalls,
     RecordedFunction,
-    parameters_replaced,
 )
 
 
@@ -146,20 +145,6 @@ def test_where_nothing_can_be_recorded_calls_are_plain_and_say_so_once(caplog):
         torch.testing.assert_close(found, outcome(mixture, mixture, inputs, 1.0))
     assert caplog.text.count("CUDA graphs cannot be used") == 1
     assert "many lines" not in caplog.text
-
-
-def test_a_module_computes_with_other_parameters_where_one_is_shared_and_one_is_none():
-    first, last = nn.Linear(2, 2, bias=False), nn.Linear(2, 2)
-    last.weight = first.weight
-    module, value = nn.Sequential(first, last), torch.tensor([[1.0, 2.0]])
-    before = module(value)
-    with parameters_replaced(module, [2 * torch.eye(2), torch.tensor([1.0, 0.0])]):
-        assert module(value).tolist() == [[5.0, 8.0]]
-    assert torch.equal(module(value), before)
-    assert last.weight is first.weight
-    assert [name for name, _ in module.named_parameters()] == ["0.weight", "1.bias"]
-    with pytest.raises(ValueError, match="zip"), parameters_replaced(module, [torch.eye(2)]):
-        pass
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
