@@ -62,7 +62,7 @@ class RecordedBlending:
             image, alpha = cuda.blend_lists(centers, conics, channels, alphas, cameras, lists, options.absgrad)
             return image + missing, alpha
 
-        inputs = [means2d, conics, channels, alphas, depths.detach(), radii]
+        inputs = [means2d, conics, channels, alphas, depths, radii]
         return self._calls(compute, inputs, [self._magnitudes], frame, epoch=(count, capacity))  # pyright: ignore
 
     def _begin(self, frame: tuple[int, int], means2d: Tensor, radii: Tensor) -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from ssa_nerfstudio.rasterization import cuda, reference
 from ssa_nerfstudio.rasterization.interface import Cameras, RenderOptions
 from ssa_nerfstudio.rasterization.projection import Splats
-from ssa_nerfstudio.rasterization.recorded_blending import LOOK_EVERY, ROOM, TIGHT, RecordedBlending
+from ssa_nerfstudio.rasterization.recorded_blending import LOOK_EVERY, ROOM, SHRINK, TIGHT, RecordedBlending
 from ssa_nerfstudio.rasterization.tile_lists import entries_of
 
 WIDTH, HEIGHT = 50, 40
@@ -137,18 +137,29 @@ def test_a_refinement_and_another_frame_begin_new_lists(device: str) -> None:
     assert len(blend._calls._known) == 2, "one for each frame"
 
 
+def needed(given: dict[str, Tensor], scale: int = 1) -> int:
+    """Entries of the lists that a view needs."""
+    return int(entries_of(given["means2d"][0], given["radii"][0], scale * WIDTH, scale * HEIGHT)[1].prod(dim=1).sum())
+
+
+def view_that_needs(least: float, most: float, device: str = "cpu") -> dict[str, Tensor]:
+    views = (view(60, 0, device, size=size) for size in torch.linspace(1.0, 6.0, 51).tolist())
+    return next(each for each in views if least < needed(each) <= most)
+
+
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_a_view_that_needs_more_than_there_is_is_not_drawn_until_the_lists_are_longer(device: str) -> None:
     blend = RecordedBlending(recorder(device))
-    small, large = view(60, 0, device, size=1.0), view(60, 0, device, size=6.0)
+    small = view(60, 0, device, size=2.0)
     for _ in range(3):
         assert outcome(blend, small)["image"].isfinite().all()
     before = blend._capacity
+    large = view_that_needs(before, 1.2 * before, device)
     missed = outcome(blend, large)
     assert missed["image"].isnan().all()
     for _ in range(2 * LOOK_EVERY):
         outcome(blend, small)
-    assert blend._capacity > ROOM * before
+    assert blend._capacity == int(ROOM * needed(large))
     assert_the_same(outcome(blend, large), outcome(plain(device), large), device)
 
 
@@ -156,9 +167,40 @@ def test_lists_are_longer_before_a_view_misses_any() -> None:
     blend = RecordedBlending(recorder("cpu"))
     outcome(blend, view(60, 0, "cpu", size=3.0))
     before = blend._capacity
-    nearly = [view(60, 0, "cpu", size=size) for size in torch.linspace(3.0, 6.0, 31).tolist()]
-    needed = [entries_of(each["means2d"][0], each["radii"][0], WIDTH, HEIGHT)[1].prod(dim=1).sum() for each in nearly]
-    given = next(each for each, count in zip(nearly, needed, strict=True) if TIGHT * before < count <= before)
+    given = view_that_needs(TIGHT * before, before)
     for _ in range(2 * LOOK_EVERY):
         assert outcome(blend, given)["image"].isfinite().all()
     assert blend._capacity > before
+
+
+def test_more_gaussians_have_room_for_as_many_entries_each_as_any_view_has_needed() -> None:
+    blend = RecordedBlending(recorder("cpu"))
+    large = view(60, 0, "cpu", size=6.0)
+    for given in (large, view(60, 0, "cpu", size=1.0)):
+        outcome(blend, given)
+    outcome(blend, view(90, 0, "cpu", size=1.0))
+    assert blend._capacity == int(ROOM * int(1.5 * needed(large)))
+
+
+def test_lists_become_shorter_little_by_little() -> None:
+    blend = RecordedBlending(recorder("cpu"))
+    outcome(blend, view(60, 0, "cpu", size=6.0))
+    found = [blend._capacity]
+    for count in (61, 60, 61):
+        outcome(blend, view(count, 0, "cpu", size=1.0))
+        found.append(blend._capacity)
+    each = [capacity / count for capacity, count in zip(found, (60, 61, 60, 61), strict=True)]
+    assert each[1] == pytest.approx(each[0], rel=0.02), "as many as the view before needed"
+    assert each[2:] == [pytest.approx(SHRINK * each[1], rel=0.02), pytest.approx(SHRINK**2 * each[1], rel=0.02)]
+
+
+def test_another_frame_has_room_from_its_first_view_on_and_takes_none_away() -> None:
+    blend = RecordedBlending(recorder("cpu"))
+    small, large = view(60, 0, "cpu", size=1.0), view(60, 0, "cpu", size=6.0)
+    for given, scale in ((large, 1), (small, 2)):
+        assert outcome(blend, given, scale=scale)["image"].isfinite().all()
+        assert blend._capacity == int(ROOM * needed(large))
+    blend = RecordedBlending(recorder("cpu"))
+    views = [(small, 1), (small, 2), (view(61, 0, "cpu", size=1.0), 1), (view(61, 0, "cpu", size=6.0), 2)]
+    for given, scale in views:
+        assert outcome(blend, given, scale=scale)["image"].isfinite().all()

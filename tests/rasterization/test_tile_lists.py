@@ -84,10 +84,12 @@ def test_lists_that_are_too_short_say_what_is_needed(capacity: int) -> None:
 
 
 def test_a_frame_of_more_tiles_than_short_keys_hold() -> None:
-    made = splats(30, 4000, 3000, 3)
+    centers, radii, depths = splats(30, 4000, 3000, 3)
+    radii[0] = 9000  # in every tile
     assert math.prod(grid_of(4000, 3000)) > torch.iinfo(torch.int16).max
-    oracle = expected(*made, 4000, 3000)
-    assert taken_apart(list_tiles(*made, 4000, 3000, 9000)) == oracle
+    oracle = expected(centers, radii, depths, 4000, 3000)
+    assert all(oracle.values())
+    assert taken_apart(list_tiles(centers, radii, depths, 4000, 3000, 60_000)) == oracle
 
 
 def test_nothing_in_front_of_the_camera() -> None:
