@@ -65,15 +65,17 @@ class LayerEstimate:
         """Whether the artifact adds light and hides nothing.
 
         What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
-        that is the greater part of all light where there is more than noise, and itself more than noise beside what
-        is hidden: bright text beside a black thumb is no reason to let the thumb add light. By squares.
+        that is the greater part of the light of details, which a film of errors has not, and more than noise beside
+        all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. By squares, where
+        there is more than noise.
         """
         opacity, added = self.opacity(), self.addition.amax(dim=-1, keepdim=True)
         present = opacity > MIN_OPACITY
-        excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)
-        light = (excess * added.square())[present].sum()
-        lit, whole = (x[present].square().sum() for x in (added, opacity))
-        return bool((light > 0.5 * lit) & (light > MIN_OPACITY * whole))
+        excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)[present]
+        details = (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0)[present].square()
+        light = (excess * added[present].square()).sum()
+        mostly = (excess * details).sum() > 0.5 * details.sum()
+        return bool(mostly & (light > MIN_OPACITY * opacity[present].square().sum()))
 
 
 @torch.no_grad()
