@@ -66,13 +66,13 @@ class LayerEstimate:
 
         What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
         that is the greater part of the light of details, which a film of errors has not, and more than noise beside
-        all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. By squares, where
-        there is more than noise.
+        all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. All by squares,
+        where there is more than noise.
         """
         opacity, added = self.opacity(), self.addition.amax(dim=-1, keepdim=True)
         present = opacity > MIN_OPACITY
         excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)[present]
-        details = (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0)[present].square()
+        details = (added * (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0))[present]
         light = (excess * added[present].square()).sum()
         mostly = (excess * details).sum() > 0.5 * details.sum()
         return bool(mostly & (light > MIN_OPACITY * opacity[present].square().sum()))
