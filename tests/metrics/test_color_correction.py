@@ -27,7 +27,9 @@ def test_it_is_the_least_squares_fit(noise, blend):
         x, y = IMAGE[..., channel].flatten().numpy(), target[..., channel].flatten().numpy()
         fit = np.polyval(np.polyfit(x, y, 1), x).clip(0, 1)
         np.testing.assert_allclose(corrected[..., channel].flatten(), fit, atol=1e-9)
-    assert psnr(corrected, target) >= psnr(IMAGE, target) - 1e-9
+    assert psnr(corrected, target) >= min(psnr(IMAGE, target), 200.0) - 1e-9, (
+        "beyond that both differ by rounding alone"
+    )
 
 
 def test_channels_are_not_mixed_and_structure_still_counts():

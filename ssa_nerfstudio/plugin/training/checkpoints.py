@@ -20,6 +20,8 @@ PARTIAL = "checkpoint.partial"
 the checkpoints' folder, because nerfstudio takes every name there for a checkpoint's."""
 LOAD_ERRORS = (RuntimeError, OSError, EOFError, UnpicklingError, LookupError, TypeError, ValueError, OverflowError)
 """What `torch.load` and a state dict raise for a file that is no usable checkpoint."""
+_FOLDER = 0x10
+"""Attribute of a folder in a zip archive. `torch.load` reads nothing of such an entry, and leaves memory as it is."""
 
 
 def step_of(checkpoint: Path) -> int:
@@ -46,9 +48,12 @@ def damage(checkpoint: Path) -> str | None:
     try:
         with zipfile.ZipFile(checkpoint) as archive:
             wrong = archive.testzip()
+            folders = [entry.filename for entry in archive.infolist() if entry.external_attr & _FOLDER]
     # zipfile raises whatever a broken directory leads it to.
     except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
         return str(error) or type(error).__name__
+    if folders:
+        return f"{folders[0]} in it is marked as a folder"
     return None if wrong is None else f"the checksum of {wrong} in it is wrong"
 
 
