@@ -1,16 +1,15 @@
 """From splatfacto's parameters to a render.
 
-On CUDA, the projection is one CUDA graph while training. What is recorded are the activations of the
-parameters and the projection. Spherical harmonics cannot be (`cuda.shade`). Sorting and blending are launched one by
-one, because the number of tiles that the Gaussians cover differs from view to view; with SSA_CUDA_GRAPHS=blending they
-are another CUDA graph, in lists with room to spare (`RecordedBlending`). A refinement makes other Gaussians, and with
-them new recordings.
+On CUDA, the projection is one CUDA graph while training: the activations of the parameters, the projection and the
+colors. Sorting and blending are launched one by one, because the number of tiles that the Gaussians cover differs from
+view to view; with SSA_CUDA_GRAPHS=blending they are another CUDA graph, in lists with room to spare
+(`RecordedBlending`). A refinement makes other Gaussians, and with them new recordings.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -58,19 +57,20 @@ class SplatRenderer:
             options: near_plane, sh_degree, render_mode, absgrad and rasterize_mode.
         """
         device = parameters["means"].device
-        gsplat = device.type == "cuda" and self._name in ("auto", "gsplat")
-        few = len(parameters["means"]) <= MOST_RECORDED
-        if not few:
+        learning = torch.is_grad_enabled() and options["render_mode"] == "RGB"
+        if len(parameters["means"]) > MOST_RECORDED:
             # Those of fewer, before the last refinement.
             self.projections.forget()
             self._blending = None
-        if gsplat and few and torch.is_grad_enabled() and options["render_mode"] == "RGB" and graphs_are_usable():
+        if learning and device.type == "cuda" and self._name in ("auto", "gsplat"):
             antialiased = options.pop("rasterize_mode") == "antialiased"
             settings = RenderOptions(
                 far_plane=FAR_PLANE, radius_clip=0.0, eps2d=EPS2D, antialiased=antialiased, **options
             )
             cameras = Cameras(viewmats, Ks, width, height, None)
-            return render_recorded(self.projections, self._recorded_blending(), parameters, cameras, settings)
+            recorded = graphs_are_usable() and len(parameters["means"]) <= MOST_RECORDED
+            calls, blending = (self.projections, self._recorded_blending()) if recorded else (None, None)
+            return render_learned(calls, blending, parameters, cameras, settings)
         gaussians = activated(parameters, options["sh_degree"] is not None)
         draw = rasterizer(self._name, device)
         return draw(**gaussians._asdict(), viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
@@ -93,39 +93,49 @@ def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussia
     return Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacities).squeeze(-1), colors)
 
 
-def render_recorded(
-    calls: RecordedCalls,
+def render_learned(
+    calls: RecordedCalls | None,
     blending: RecordedBlending | None,
     parameters: Mapping[str, Tensor],
     cameras: Cameras,
     options: RenderOptions,
 ) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Render with gsplat's kernels, the projection as a recording.
+    """Render for a training step with gsplat's kernels, and one of ours for the harmonics.
 
     Args:
-        calls: of this training.
-        blending: of this training; None: kernels are launched one by one.
+        calls: records the projection; None: its kernels are launched one by one.
+        blending: records sorting and blending; None: their kernels are launched one by one.
         parameters: of N Gaussians, `PARAMETERS`.
-        cameras: without a background.
+        cameras: one, without a background.
         options: with `render_mode` RGB.
 
     Returns:
         As of `interface.make_rasterization`.
     """
-    from ssa_nerfstudio.rasterization import cuda
+    from ssa_nerfstudio.rasterization import cuda, harmonics
+
+    degree = options.sh_degree
+
+    def colors_of(viewmats: Tensor, radii: Tensor, values: Sequence[Tensor]) -> Tensor:
+        means, *_, constant, rest = values
+        if degree is None:
+            return torch.sigmoid(constant)[None]
+        return harmonics.shade(means, cuda.centers(viewmats)[0], constant, rest, radii[0], degree)[None]
 
     def compute(viewmats: Tensor, Ks: Tensor, *values: Tensor) -> tuple[Tensor, ...]:
-        gaussians = activated(dict(zip(PARAMETERS, values, strict=True)), options.sh_degree is not None)
+        means, quats, scales, opacities, constant, _ = values
+        gaussians = Gaussians(means, quats, torch.exp(scales), torch.sigmoid(opacities).squeeze(-1), constant)
         projected = cuda.project(gaussians, cameras._replace(viewmats=viewmats, Ks=Ks), options)
         # Depths sort, and are no part of the picture.
         projected = projected._replace(depths=projected.depths.detach())
-        return gaussians.colors, *(each for each in projected if each is not None)
+        return (*projected, *([colors_of(viewmats, projected.radii, values)] if with_colors else ()))
 
-    kind, degree = (cameras.width, cameras.height, *vars(options).values()), options.sh_degree
-    views, learned = [cameras.viewmats, cameras.Ks], [parameters[name] for name in PARAMETERS]
-    colors, *rest = calls(compute, views, learned, kind, epoch=degree)  # a training does not go back to one
-    means2d, conics, alphas, depths, radii, *directions = rest
-    projected = cuda.Projected(means2d, conics, alphas, depths, radii, directions[0] if directions else None)
-    blend = blending or cuda.blend
-    image, alpha = blend(projected, cuda.shade(projected, colors, options), cameras, options)
+    learned = [parameters[name] for name in PARAMETERS]
+    with_colors = degree is None or harmonics.runs_on_current_stream(learned[0].device, degree)
+    views, kind = [cameras.viewmats, cameras.Ks], (cameras.width, cameras.height, *vars(options).values())
+    # A training does not go back to a degree.
+    found = calls(compute, views, learned, kind, epoch=degree) if calls else compute(*views, *learned)
+    projected = cuda.Projected(*found[: len(cuda.Projected._fields)])
+    channels = found[-1] if with_colors else colors_of(cameras.viewmats, projected.radii, learned)
+    image, alpha = (blending or cuda.blend)(projected, channels, cameras, options)
     return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)

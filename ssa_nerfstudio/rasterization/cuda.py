@@ -31,7 +31,6 @@ class Projected(NamedTuple):
     alphas: Tensor  # [C, N]
     depths: Tensor  # [C, N], world units
     radii: Tensor  # [C, N] int32, pixels
-    directions: Tensor | None  # [C, N, 3] from the cameras, where colors are spherical harmonics
 
 
 def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> Projected:
@@ -57,26 +56,24 @@ def project(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> P
     alphas = opacities.expand(n_cameras, -1)
     if compensations is not None:
         alphas = alphas * compensations
-    directions = None
-    if options.sh_degree is not None:
-        # No matrix product: a recording of cuBLAS holds 32 MiB.
-        centers = -(viewmats[:, :3, :3] * viewmats[:, :3, 3:]).sum(dim=1, keepdim=True)  # [C, 1, 3]
-        directions = means - centers
-    return Projected(means2d, conics, alphas.contiguous(), depths, radii, directions)
+    return Projected(means2d, conics, alphas.contiguous(), depths, radii)
 
 
-def shade(projected: Projected, colors: Tensor, options: RenderOptions) -> Tensor:
-    """Channels [C, N, X] of projected Gaussians with given colors, as `render_mode` says.
+def centers(viewmats: Tensor) -> Tensor:
+    """Positions [C, 3] of cameras whose rigid world-to-camera matrices [C, 4, 4] are given."""
+    # No matrix product: a recording of cuBLAS holds 32 MiB.
+    return -(viewmats[:, :3, :3] * viewmats[:, :3, 3:]).sum(dim=1)
 
-    gsplat 1.4.0 evaluates spherical harmonics on the default stream, whatever the current one is
-    (cuda/csrc/compute_sh_fwd.cu:60, compute_sh_bwd.cu:80), so a CUDA graph does not capture them.
-    """
-    if projected.directions is None or options.sh_degree is None:
-        rgb = colors.expand(len(projected.radii), -1, -1)
+
+def shade(gaussians: Gaussians, projected: Projected, cameras: Cameras, options: RenderOptions) -> Tensor:
+    """Channels [C, N, X] of projected Gaussians, as `render_mode` says."""
+    n_cameras, colors = len(projected.radii), gaussians.colors
+    if options.sh_degree is None:
+        rgb = colors.expand(n_cameras, -1, -1)
     else:
-        coefficients = colors.expand(len(projected.radii), -1, -1, -1)
-        masks = projected.radii > 0
-        rgb = spherical_harmonics(options.sh_degree, projected.directions, coefficients, masks=masks)
+        directions = gaussians.means - centers(cameras.viewmats)[:, None]
+        coefficients = colors.expand(n_cameras, -1, -1, -1)
+        rgb = spherical_harmonics(options.sh_degree, directions, coefficients, masks=projected.radii > 0)
         rgb = torch.clamp_min(rgb + 0.5, 0.0)
     if options.render_mode == "RGB":
         return rgb
@@ -86,7 +83,7 @@ def shade(projected: Projected, colors: Tensor, options: RenderOptions) -> Tenso
 
 def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor]:
     """Blend with gsplat's kernels: render [C, H, W, X] and alpha [C, H, W, 1]. It reads the device once."""
-    means2d, conics, alphas, depths, radii, _ = projected
+    means2d, conics, alphas, depths, radii = projected
     n_cameras, width, height, backgrounds = len(means2d), cameras.width, cameras.height, cameras.backgrounds
     if options.render_mode != "RGB" and backgrounds is not None:
         backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
@@ -147,7 +144,7 @@ def blend_lists(
 def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Render with gsplat's kernels. See `interface.Render`."""
     projected = project(gaussians, cameras, options)
-    channels = shade(projected, gaussians.colors, options)
+    channels = shade(gaussians, projected, cameras, options)
     return *blend(projected, channels, cameras, options), projected.radii, projected.means2d
 
 

@@ -41,7 +41,7 @@ class RecordedBlending:
         self, projected: cuda.Projected, channels: Tensor, cameras: Cameras, options: RenderOptions
     ) -> tuple[Tensor, Tensor]:
         """As `cuda.blend`, of one camera, without a background, in the mode RGB."""
-        means2d, conics, alphas, depths, radii, _ = projected
+        means2d, conics, alphas, depths, radii = projected
         count, frame = means2d.shape[1], (cameras.width, cameras.height)
         if count != self._count or frame not in self._frames:
             self._begin(frame, means2d, radii)

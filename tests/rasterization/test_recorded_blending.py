@@ -73,7 +73,7 @@ def view(count: int, seed: int, device: str, size: float = 4.0) -> dict[str, Ten
 def outcome(blend: Any, given: dict[str, Tensor], absgrad: bool = True, scale: int = 1) -> dict[str, Tensor]:
     for name in NAMES:
         given[name].grad = None
-    projected = cuda.Projected(**{name: given[name] for name in cuda.Projected._fields[:-1]}, directions=None)
+    projected = cuda.Projected(**{name: given[name] for name in cuda.Projected._fields})
     frame = Cameras(torch.eye(4)[None], torch.eye(3)[None], scale * WIDTH, scale * HEIGHT, None)
     options = RenderOptions(0.01, 1e10, 0.0, 0.3, None, "RGB", absgrad=absgrad, antialiased=False)
     image, alpha = blend(projected, given["channels"], frame, options)
