@@ -165,7 +165,7 @@ def _growth(trainer: Any, count: int) -> TrainingCallback:
 
 
 def _write_profile(trainer: Any, path: Path) -> None:
-    """Train, and write what `PROFILED` holds: launches and milliseconds a step, operations by the host's own time."""
+    """Train, and write what `PROFILED` holds: launches and milliseconds a step, operations by the time of each side."""
     profiler = torch.profiler.profile(activities=torch.profiler.supported_activities())
 
     def note(step: int) -> None:
@@ -182,6 +182,7 @@ def _write_profile(trainer: Any, path: Path) -> None:
     names = ("launch", "memcpyasync", "memsetasync", "synchronize")
     runtime = {e.key: e.count / steps for e in found if any(name in e.key.lower() for name in names)}
     busy = sum(e.self_device_time_total for e in found if e.device_type != torch.autograd.DeviceType.CPU)
+    kinds = ("cpu", "cuda") if torch.cuda.is_available() else ("cpu",)
     lines = [
         f"{trainer.pipeline.model.num_points} Gaussians, steps {PROFILED[0]} to {PROFILED[1]}",
         f"aten operations a step: {sum(e.count for e in found if e.key.startswith('aten::')) / steps:.1f}",
@@ -191,7 +192,7 @@ def _write_profile(trainer: Any, path: Path) -> None:
         f"{torch.cuda.max_memory_reserved() / 2**20:.0f} MiB reserved",
         *(f"{name}: {count:.2f} a step" for name, count in sorted(runtime.items(), key=lambda item: -item[1])),
         "",
-        found.table(sort_by="self_cpu_time_total", row_limit=40, max_name_column_width=80),
+        *(found.table(sort_by=f"self_{kind}_time_total", row_limit=40, max_name_column_width=80) for kind in kinds),
     ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
