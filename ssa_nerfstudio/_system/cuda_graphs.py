@@ -266,6 +266,8 @@ class RecordedChanges:
             self._known[key] = None
             if len(self._known) > self._limit:
                 del self._known[next(iter(self._known))]
+                if not any(self._known.values()):
+                    self._record = None  # nothing can be captured into a pool whose last graph is gone
         (repeat or program)()
 
 

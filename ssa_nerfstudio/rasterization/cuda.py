@@ -16,6 +16,7 @@ from gsplat import (
     rasterize_to_pixels,
     spherical_harmonics,
 )
+from gsplat.cuda._wrapper import _RasterizeToPixels
 from torch import Tensor
 
 from ssa_nerfstudio.rasterization.constants import TILE
@@ -116,29 +117,38 @@ def blend_lists(
     alphas: Tensor,
     cameras: Cameras,
     lists: TileLists,
-    absgrad: bool,
+    magnitudes: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """Blend one camera's Gaussians as `blend` does, by lists of a given length, all on the current stream.
 
     Args:
-        means2d, conics, channels, alphas: of `Projected` and `shade`, [1, N, ...].
+        means2d, conics, channels, alphas: of `Projected` and of `shade`, [1, N, ...].
         cameras: one, without a background.
         lists: of its tiles.
-        absgrad: as in `RenderOptions`.
+        magnitudes: [1, N, 2]; its gradient becomes the sums of magnitudes that `absgrad` leaves elsewhere.
     """
-    return rasterize_to_pixels(
-        means2d,
-        conics,
-        channels,
-        alphas,
-        cameras.width,
-        cameras.height,
-        TILE,
-        lists.offsets,
-        lists.gaussians,
-        masks=lists.drawn,
-        absgrad=absgrad,
+    given = [each.contiguous() for each in (means2d, conics, channels, alphas)]
+    frame = cameras.width, cameras.height, TILE
+    return _Blended.apply(  # pyright: ignore[reportReturnType]
+        *given, None, lists.drawn, *frame, lists.offsets, lists.gaussians, magnitudes is not None, magnitudes
     )
+
+
+class _Blended(_RasterizeToPixels):
+    """gsplat's operation, with the summed magnitudes as a gradient of its last argument.
+
+    gsplat leaves them as an attribute of the centers, which nothing holds where they are part of a recording.
+    """
+
+    @staticmethod
+    def forward(ctx, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return _RasterizeToPixels.forward(ctx, *given[:-1])
+
+    @staticmethod
+    def backward(ctx, *slopes):  # pyright: ignore[reportIncompatibleMethodOverride]
+        means2d = ctx.saved_tensors[0]
+        found = _RasterizeToPixels.backward(ctx, *slopes)
+        return *found, vars(means2d).pop("absgrad", None)
 
 
 def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable
 
 import torch
@@ -54,12 +53,11 @@ class RecordedBlending:
 
         def compute(*values: Tensor) -> tuple[Tensor, ...]:
             centers, conics, channels, alphas, depths, radii, magnitudes = values
+            wanted = magnitudes if options.absgrad else None
             lists = list_tiles(centers[0], radii[0], depths[0], cameras.width, cameras.height, capacity)
             torch.maximum(self._needed, lists.needed, out=self._needed)
-            if options.absgrad:
-                centers = _with_magnitudes(centers, magnitudes)
             missing = torch.zeros_like(alphas[0, 0]).masked_fill_(lists.needed > capacity, torch.nan)
-            image, alpha = cuda.blend_lists(centers, conics, channels, alphas, cameras, lists, options.absgrad)
+            image, alpha = cuda.blend_lists(centers, conics, channels, alphas, cameras, lists, wanted)
             return image + missing, alpha
 
         inputs = [means2d, conics, channels, alphas, depths, radii]
@@ -101,13 +99,3 @@ class RecordedBlending:
 
 def _room_for(needed: int) -> int:
     return max(1, int(ROOM * needed))
-
-
-def _with_magnitudes(centers: Tensor, magnitudes: Tensor) -> Tensor:
-    """The centers [1, N, 2], whose summed magnitudes of gradients become the gradient of zeros [1, N, 2]."""
-    zeros = magnitudes.view_as(magnitudes)
-    shifted = centers + zeros
-    # gsplat leaves them at the tensor that it blends. The tensor itself would be held by its own graph.
-    blended = weakref.ref(shifted)
-    zeros.register_hook(lambda _: getattr(blended(), "absgrad"))  # noqa: B009 - no attribute of tensors
-    return shifted

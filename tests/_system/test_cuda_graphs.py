@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
+import weakref
+
 import pytest
 import torch
 from recordings import CUDA, recorder, run_again
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import (
-    CapturedPrograms,
-    RecordedCalls,
-    RecordedFunction,
-)
+from ssa_nerfstudio._system import cuda_graphs
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, RecordedChanges, RecordedFunction
 
 
 class Mixture:
@@ -157,3 +156,38 @@ def test_captures_share_the_memory_that_a_library_holds_for_their_stream():
         del product, record
         held.append(torch.cuda.memory_allocated())
     assert held[-1] == held[1]  # cuBLAS takes 32 MiB once
+
+
+def add(total: Tensor) -> None:
+    total += 1
+
+
+class FormerPool:
+    """In place of `CapturedPrograms`: as CUDA does, it captures nothing once all that it captured is gone."""
+
+    def __init__(self) -> None:
+        self._alive: list[weakref.ref] = []
+
+    def capture(self, program):
+        if self._alive and not any(each() for each in self._alive):
+            raise RuntimeError("the pool's last graph is gone")
+
+        def replay() -> None:
+            program()
+
+        self._alive.append(weakref.ref(replay))
+        return [], replay
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_changes_are_recorded_after_all_earlier_recordings_were_given_up(device, monkeypatch, caplog):
+    if device == "cpu":
+        monkeypatch.setattr(cuda_graphs, "CapturedPrograms", FormerPool)
+    changes, total = RecordedChanges(limit=2), torch.zeros((), device=device)
+    random = torch.zeros(3, device=device)
+    for key in "aaabbbcdefggghhhaaa":
+        changes(lambda: add(total), key)
+        random.uniform_()  # a capture that fails would break the generator
+    assert total.item() == len("aaabbbcdefggghhhaaa")
+    assert changes._known["a"] is not None
+    assert "cannot be used" not in caplog.text

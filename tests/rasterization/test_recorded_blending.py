@@ -10,10 +10,11 @@ from recordings import CUDA, recorder
 from torch import Tensor
 
 from ssa_nerfstudio.rasterization import cuda, reference
+from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.interface import Cameras, RenderOptions
 from ssa_nerfstudio.rasterization.projection import Splats
 from ssa_nerfstudio.rasterization.recorded_blending import LOOK_EVERY, ROOM, SHRINK, TIGHT, RecordedBlending
-from ssa_nerfstudio.rasterization.tile_lists import entries_of
+from ssa_nerfstudio.rasterization.tile_lists import TileLists, entries_of
 
 WIDTH, HEIGHT = 50, 40
 NAMES = ("means2d", "conics", "alphas", "channels")
@@ -24,35 +25,36 @@ def blended_by_torch(
     conics: Tensor,
     colors: Tensor,
     alphas: Tensor,
-    width: int,
-    height: int,
-    tile: int,
-    offsets: Tensor,
-    ids: Tensor,
-    masks: Tensor,
-    absgrad: bool,
+    cameras: Cameras,
+    lists: TileLists,
+    magnitudes: Tensor | None,
 ) -> tuple[Tensor, Tensor]:
     """What gsplat's kernels draw, and, in place of the sums of magnitudes, three times the gradients."""
+    centers = means2d[0] if magnitudes is None else (means2d + 3 * magnitudes)[0]
+    width, height, ids = cameras.width, cameras.height, lists.gaussians
     image, alpha = means2d.new_zeros(height, width, 3), means2d.new_zeros(height, width, 1)
-    starts = [*offsets.flatten().tolist(), len(ids)]
-    splats = Splats(ids, ids, means2d[0], conics[0], alphas[0], colors[0])
-    for i in range(offsets.numel()):
-        row, column = divmod(i, offsets.shape[2])
-        if masks.flatten()[i]:
-            edges = row * tile, min(row * tile + tile, height), column * tile, min(column * tile + tile, width)
+    starts = [*lists.offsets.flatten().tolist(), len(ids)]
+    splats = Splats(ids, ids, centers, conics[0], alphas[0], colors[0])
+    for i in range(lists.offsets.numel()):
+        row, column = divmod(i, lists.offsets.shape[2])
+        if lists.drawn.flatten()[i]:
+            edges = row * TILE, min(row * TILE + TILE, height), column * TILE, min(column * TILE + TILE, width)
             here = ids[starts[i] : starts[i + 1]].long()
-            color, opaque = reference._blend_tile(splats, means2d[0], here, *edges)
+            color, opaque = reference._blend_tile(splats, centers, here, *edges)
             image[edges[0] : edges[1], edges[2] : edges[3]] = color
             alpha[edges[0] : edges[1], edges[2] : edges[3]] = opaque
-    if absgrad:
-        means2d.register_hook(lambda gradient: setattr(means2d, "absgrad", 3 * gradient))
     return image[None], alpha[None]
 
 
 @pytest.fixture(autouse=True)
 def kernels(monkeypatch: pytest.MonkeyPatch) -> None:
-    if not torch.cuda.is_available():
-        monkeypatch.setattr(cuda, "rasterize_to_pixels", blended_by_torch)
+    """gsplat's blend on CUDA only."""
+    of_gsplat = cuda.blend_lists
+    monkeypatch.setattr(
+        cuda,
+        "blend_lists",
+        lambda means2d, *given: (of_gsplat if means2d.is_cuda else blended_by_torch)(means2d, *given),
+    )
 
 
 def view(count: int, seed: int, device: str, size: float = 4.0) -> dict[str, Tensor]:
