@@ -47,9 +47,8 @@ class _Shaded(torch.autograd.Function):
     ) -> Tensor:
         from ssa_nerfstudio.rasterization._harmonics_triton import colors_of
 
-        given = tuple(each.contiguous() for each in (means, center, constant, rest, radii))
-        colors = colors_of(*given, degree)
-        means, center, _, rest, radii = given
+        means, center, constant, rest, radii = (each.contiguous() for each in (means, center, constant, rest, radii))
+        colors = colors_of(means, center, constant, rest, radii, degree)
         ctx.save_for_backward(means, center, rest, radii, colors)
         ctx.degree = degree
         return colors
@@ -59,7 +58,8 @@ class _Shaded(torch.autograd.Function):
     def backward(ctx, slopes: Tensor) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         from ssa_nerfstudio.rasterization._harmonics_triton import gradients_of
 
-        found = gradients_of(*ctx.saved_tensors, slopes.contiguous(), ctx.degree)
-        of_means, of_constant, of_rest = found
+        means, center, rest, radii, colors = ctx.saved_tensors
+        slopes = slopes.contiguous()
+        of_means, of_constant, of_rest = gradients_of(means, center, rest, radii, colors, slopes, ctx.degree)
         of_center = -of_means.sum(dim=0) if ctx.needs_input_grad[1] else None
         return of_means, of_center, of_constant, of_rest, None, None
