@@ -39,24 +39,33 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
     modes = _modes(height, width).to(samples.color.device)
     radial = modes[:, :RADIAL_MODES]
     found = _regression(samples, modes).square()
-    log_transmittance = modes.new_zeros(height * width)
-    # Of a lens nearly all is r^2; of a watermark in the middle of the frame, which is radial, too, it is not.
-    if max(_chance(found, RADIAL_MODES), _chance(found, 1)) < SIGNIFICANCE:
-        # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
-        log_transmittance = radial @ _regression(samples, radial)
+    nothing = samples.color.new_ones(height, width, 1)
+    if _chance(found) >= SIGNIFICANCE:
+        return nothing
+    # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
+    log_transmittance = radial @ _regression(samples, radial)
     clearest = log_transmittance.kthvalue(max(1, round((1 - CLEAR_SHARE) * height * width))).values
-    if log_transmittance[height // 2 * width + width // 2] < clearest:
-        # What is darkest in the middle is in front of the lens.
-        return samples.color.new_ones(height, width, 1)
+    # A lens darkens from the middle outwards, and the farther out the faster. A logo in the middle does not: outside of
+    # it nothing changes any more.
+    middle, halfway, corner = (log_transmittance[y * width + x] for y, x in _ways_out(height, width))
+    if middle < clearest or middle - halfway > halfway - corner:
+        return nothing
     clear = log_transmittance[log_transmittance >= clearest].mean()
     return (log_transmittance - clear).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
-def _chance(squares: Tensor, first: int) -> float:
-    """Probability that the first of modes of equal variance have as large a share of these squares [K] (F-test)."""
-    others = squares[first:].mean()
-    ratio = float(squares[:first].mean() / others) if others > 0 else 0.0
-    return float(fdtrc(first, len(squares) - first, ratio))
+def _chance(squares: Tensor) -> float:
+    """Probability that radial modes have as large a share of these squares [K] if all have one variance (F-test)."""
+    others = squares[RADIAL_MODES:].mean()
+    ratio = float(squares[:RADIAL_MODES].mean() / others) if others > 0 else 0.0
+    return float(fdtrc(RADIAL_MODES, len(squares) - RADIAL_MODES, ratio))
+
+
+def _ways_out(height: int, width: int) -> list[tuple[int, int]]:
+    """Pixels in the middle of the frame, halfway to its last corner, and there: y and x."""
+    middle = height // 2, width // 2
+    corner = height - 1, width - 1
+    return [middle, ((middle[0] + corner[0]) // 2, (middle[1] + corner[1]) // 2), corner]
 
 
 def _modes(height: int, width: int) -> Tensor:

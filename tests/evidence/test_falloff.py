@@ -22,6 +22,8 @@ NOT_RADIAL = {
     "an operator in the middle of the lower face": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X, Y) - 0.3) / 0.05),
     "a dark middle": (1 - 6 * (torch.hypot(X, Y) - 0.33).square()).clamp_min(0.2),
     "a watermark in the middle": 1 + 2 * torch.sigmoid((0.15 - torch.hypot(X, Y)) / 0.02),
+    "a large one": 1 + 2 * torch.sigmoid((0.3 - torch.hypot(X, Y)) / 0.05),
+    "a soft one": 1 + 2 * torch.sigmoid((0.4 - torch.hypot(X, Y)) / 0.1),
     "a finger": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X - 0.7, Y - 0.5) - 0.4) / 0.05),
 }
 
