@@ -2,7 +2,7 @@
 
 Full resolution, unscaled schedules, the whole body of nerfstudio's training loop, steps 700 to 1099 of one process; the
 device is synchronized at both ends only. Run the methods in turn, several times: a machine drifts more than they
-differ; with --alternate one process trains without CUDA graphs and with by turns, up to step 1899. --profile writes
+differ; with --alternate one process trains without CUDA graphs and with by turns, up to step 1499. --profile writes
 where the host's time goes. A large scene is made of a small one with --gaussians and --enlarge.
 """
 
@@ -37,7 +37,7 @@ FIRST, LAST = 699, 1099
 150 ms to load its kernels."""
 TURN = 100
 """Steps of a turn with --alternate, as many as from one refinement to the next."""
-GRAPHS = {"off": "0", "on": "1", "with blending": "blending"}
+GRAPHS = {"off": "0", "on": "1"}
 """Values of SSA_CUDA_GRAPHS that take turns with --alternate."""
 GROWN = 610
 """Step after which --gaussians splits, and from which on their number stays."""
@@ -62,8 +62,7 @@ class Command:
     """Enlarge the photos by this: the work of a capture with more pixels, not its details."""
 
     alternate: bool = False
-    """Take turns of 100 steps, four without CUDA graphs (SSA_CUDA_GRAPHS=0), four with, and four with that of blending,
-    too (SSA_CUDA_GRAPHS=blending), and print a line for each."""
+    """Take turns of 100 steps, four without CUDA graphs (SSA_CUDA_GRAPHS=0), four with, and print a line for each."""
     profile: Path | None = None
     """Write a table of torch's profiler to this file, and end after the steps that are in it."""
 

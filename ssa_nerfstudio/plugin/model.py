@@ -66,7 +66,7 @@ class SSASplatfactoModel(PhotoLosses):
             self.gauss_params["features_dc"] = Parameter(color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
-        self._draw = SplatRenderer(self.config.rasterizer, self.config.guards)
+        self._draw = SplatRenderer(self.config.rasterizer)
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))

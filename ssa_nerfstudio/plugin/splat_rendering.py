@@ -2,15 +2,13 @@
 
 On CUDA, the projection is one CUDA graph while training: the activations of the parameters, the projection and the
 colors. Sorting and blending are launched one by one, because the number of tiles that the Gaussians cover differs from
-view to view; with SSA_CUDA_GRAPHS=blending they are another CUDA graph, in lists with room to spare
-(`RecordedBlending`). A refinement makes other Gaussians, and with them new recordings.
+view to view. A refinement makes other Gaussians, and with them new recordings.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,9 +17,6 @@ from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, 
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
 from ssa_nerfstudio.rasterization.constants import EPS2D, FAR_PLANE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, info_of
-
-if TYPE_CHECKING:
-    from ssa_nerfstudio.rasterization.recorded_blending import RecordedBlending
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 """Of the Gaussians, by the names that splatfacto gives them."""
@@ -33,12 +28,9 @@ recording keeps copies of their gradients. Source: docs/results.md, "Large scene
 class SplatRenderer:
     """Renders Gaussians of which the parameters are given as they are learned."""
 
-    def __init__(self, name: RasterizerName, guarded: bool = True) -> None:
-        """Render with a rasterizer; `guarded`: steps that are not finite are skipped, as `RecordedBlending` wants."""
+    def __init__(self, name: RasterizerName) -> None:
         self._name: RasterizerName = name
-        self._guarded = guarded
         self.projections = RecordedCalls(CapturedPrograms)
-        self._blending: RecordedBlending | None = None
 
     def __call__(
         self,
@@ -61,7 +53,6 @@ class SplatRenderer:
         if len(parameters["means"]) > MOST_RECORDED:
             # Those of fewer, before the last refinement.
             self.projections.forget()
-            self._blending = None
         if learning and device.type == "cuda" and self._name in ("auto", "gsplat"):
             antialiased = options.pop("rasterize_mode") == "antialiased"
             settings = RenderOptions(
@@ -69,21 +60,10 @@ class SplatRenderer:
             )
             cameras = Cameras(viewmats, Ks, width, height, None)
             recorded = graphs_are_usable() and len(parameters["means"]) <= MOST_RECORDED
-            calls, blending = (self.projections, self._recorded_blending()) if recorded else (None, None)
-            return render_learned(calls, blending, parameters, cameras, settings)
+            return render_learned(self.projections if recorded else None, parameters, cameras, settings)
         gaussians = activated(parameters, options["sh_degree"] is not None)
         draw = rasterizer(self._name, device)
         return draw(**gaussians._asdict(), viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
-
-    def _recorded_blending(self) -> RecordedBlending | None:
-        """What blends in one launch; None where kernels are launched one by one."""
-        if not self._guarded or os.environ.get("SSA_CUDA_GRAPHS") != "blending":
-            return None
-        if self._blending is None:
-            from ssa_nerfstudio.rasterization.recorded_blending import RecordedBlending
-
-            self._blending = RecordedBlending()
-        return self._blending
 
 
 def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussians:
@@ -95,7 +75,6 @@ def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussia
 
 def render_learned(
     calls: RecordedCalls | None,
-    blending: RecordedBlending | None,
     parameters: Mapping[str, Tensor],
     cameras: Cameras,
     options: RenderOptions,
@@ -104,7 +83,6 @@ def render_learned(
 
     Args:
         calls: records the projection; None: its kernels are launched one by one.
-        blending: records sorting and blending; None: their kernels are launched one by one.
         parameters: of N Gaussians, `PARAMETERS`.
         cameras: one, without a background.
         options: with `render_mode` RGB.
@@ -137,5 +115,5 @@ def render_learned(
     found = calls(compute, views, learned, kind, epoch=degree) if calls else compute(*views, *learned)
     projected = cuda.Projected(*found[: len(cuda.Projected._fields)])
     channels = found[-1] if with_colors else colors_of(cameras.viewmats, projected.radii, learned)
-    image, alpha = (blending or cuda.blend)(projected, channels, cameras, options)
+    image, alpha = cuda.blend(projected, channels, cameras, options)
     return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)

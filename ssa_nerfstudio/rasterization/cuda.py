@@ -6,6 +6,7 @@ view matrix with `torch.inverse`, which waits for the device at every frame. A r
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -16,12 +17,10 @@ from gsplat import (
     rasterize_to_pixels,
     spherical_harmonics,
 )
-from gsplat.cuda._wrapper import _RasterizeToPixels
 from torch import Tensor
 
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, make_rasterization
-from ssa_nerfstudio.rasterization.tile_lists import TileLists, grid_of
 
 
 class Projected(NamedTuple):
@@ -89,7 +88,7 @@ def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: Ren
     if options.render_mode != "RGB" and backgrounds is not None:
         backgrounds = torch.cat([backgrounds, backgrounds.new_zeros(n_cameras, 1)], dim=-1)
         backgrounds = backgrounds[:, -channels.shape[-1] :]
-    tiles = grid_of(width, height)
+    tiles = math.ceil(width / TILE), math.ceil(height / TILE)
     _, isect_ids, flatten_ids = isect_tiles(means2d, radii, depths, TILE, *tiles, packed=False, n_cameras=n_cameras)
     offsets = isect_offset_encode(isect_ids, n_cameras, *tiles)
     image, alpha = rasterize_to_pixels(
@@ -108,47 +107,6 @@ def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: Ren
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], dim=-1)
     return image, alpha
-
-
-def blend_lists(
-    means2d: Tensor,
-    conics: Tensor,
-    channels: Tensor,
-    alphas: Tensor,
-    cameras: Cameras,
-    lists: TileLists,
-    magnitudes: Tensor | None,
-) -> tuple[Tensor, Tensor]:
-    """Blend one camera's Gaussians as `blend` does, by lists of a given length, all on the current stream.
-
-    Args:
-        means2d, conics, channels, alphas: of `Projected` and of `shade`, [1, N, ...].
-        cameras: one, without a background.
-        lists: of its tiles.
-        magnitudes: [1, N, 2]; its gradient becomes the sums of magnitudes that `absgrad` leaves elsewhere.
-    """
-    given = [each.contiguous() for each in (means2d, conics, channels, alphas)]
-    frame = cameras.width, cameras.height, TILE
-    return _Blended.apply(  # pyright: ignore[reportReturnType]
-        *given, None, lists.drawn, *frame, lists.offsets, lists.gaussians, magnitudes is not None, magnitudes
-    )
-
-
-class _Blended(_RasterizeToPixels):
-    """gsplat's operation, with the summed magnitudes as a gradient of its last argument.
-
-    gsplat leaves them as an attribute of the centers, which nothing holds where they are part of a recording.
-    """
-
-    @staticmethod
-    def forward(ctx, *given):  # pyright: ignore[reportIncompatibleMethodOverride]
-        return _RasterizeToPixels.forward(ctx, *given[:-1])
-
-    @staticmethod
-    def backward(ctx, *slopes):  # pyright: ignore[reportIncompatibleMethodOverride]
-        means2d = ctx.saved_tensors[0]
-        found = _RasterizeToPixels.backward(ctx, *slopes)
-        return *found, vars(means2d).pop("absgrad", None)
 
 
 def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:
