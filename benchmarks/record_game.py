@@ -10,16 +10,16 @@ plays the game and brings Freedoom's maps and pictures (modified BSD).
 from __future__ import annotations
 
 import json
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
+from games.doom_map import Map
+from games.random_walk import random_walk
 from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
@@ -53,125 +53,6 @@ WALK = (
     *("360,-130,-40", "280,-210,-20", "190,-120,0", "220,-60,20"),
 )
 """Through the first rooms of Freedoom 2's MAP01."""
-
-# Rows of a map's lumps (https://doomwiki.org/wiki/WAD).
-_THING = np.dtype([("x", "<i2"), ("y", "<i2"), ("angle", "<i2"), ("kind", "<i2"), ("flags", "<i2")])
-_PLAYER = 1
-_VERTEX = np.dtype(("<i2", 2))
-_LINE = np.dtype([("ends", "<u2", 2), ("flags", "<u2"), ("special", "<u2", 2), ("sides", "<u2", 2)])
-_SIDE = np.dtype([("offset", "<i2", 2), ("textures", "S8", 3), ("sector", "<u2")])
-_SECTOR = np.dtype([("floor", "<i2"), ("ceiling", "<i2"), ("flats", "S8", 2), ("light", "<i2"), ("special", "<i2", 2)])
-_NO_SIDE = 0xFFFF
-_LUMPS = 10
-
-
-@dataclass(frozen=True)
-class Map:
-    """A map of Doom: its name and its lumps."""
-
-    name: str
-    lumps: dict[str, bytes]
-
-    @classmethod
-    def read(cls, wad: Path, name: str) -> Map:
-        """Read a map from a WAD file.
-
-        Raises:
-            InputError: the file is no WAD, or has no such map.
-        """
-        data = wad.read_bytes() if wad.is_file() else b""
-        if data[:4] not in (b"IWAD", b"PWAD"):
-            raise InputError(f"{wad} is no WAD file", "name freedoom1, freedoom2, or the path of a .wad file")
-        count, at = struct.unpack("<ii", data[4:12])
-        entries = [struct.unpack("<ii8s", data[at + 16 * i : at + 16 * i + 16]) for i in range(count)]
-        names = [raw.rstrip(b"\0").decode("latin1") for _, _, raw in entries]
-        if name not in names:
-            maps = [names[i - 1] for i, lump in enumerate(names) if lump == "THINGS"]
-            raise InputError(f"{wad} has no map {name}", f"choose one of {', '.join(maps)}")
-        first = names.index(name) + 1
-        chosen = range(first, first + _LUMPS)
-        return cls(name, {names[i]: data[entries[i][0] : entries[i][0] + entries[i][1]] for i in chosen})
-
-    @property
-    def start(self) -> str:
-        """Where the game starts a player, as a waypoint."""
-        things = self._rows("THINGS", _THING)
-        return ",".join(str(value) for value in things[things["kind"] == _PLAYER][0].item()[:3])
-
-    def static(self, start: np.ndarray) -> Map:
-        """The map with the player its only thing, in which nothing moves, opens, flickers or hurts.
-
-        Args:
-            start: x, y and direction of the player.
-        """
-        lines, sectors = self._rows("LINEDEFS", _LINE).copy(), self._rows("SECTORS", _SECTOR).copy()
-        lines["special"] = sectors["special"] = 0
-        player = np.array((*np.rint(start).astype(int), _PLAYER, 7), _THING)
-        emptied = {"THINGS": player.tobytes(), "LINEDEFS": lines.tobytes(), "SECTORS": sectors.tobytes()}
-        return Map(self.name, {**self.lumps, **emptied})
-
-    def write(self, path: Path) -> None:
-        """Write a WAD file that holds the map alone."""
-        body, entries = b"", struct.pack("<ii8s", 0, 0, self.name.encode())
-        for name, lump in self.lumps.items():
-            entries += struct.pack("<ii8s", 12 + len(body), len(lump), name.encode())
-            body += lump
-        path.write_bytes(struct.pack("<4sii", b"PWAD", len(self.lumps) + 1, 12 + len(body)) + body + entries)
-
-    def trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Follow rays to the first wall, floor or ceiling. The game's own depth has 8 bits, this none to spare.
-
-        Args:
-            origin: [3], inside a sector.
-            directions: [N, 3], not vertical.
-
-        Returns:
-            Depth [N] in multiples of the directions, and whether it is a surface [N]: not where a ray ends in the sky.
-        """
-        start, along, sector = self._walls
-        floor, ceiling, sky = (self._sectors[key] for key in ("floor", "ceiling", "sky"))
-        start = start - origin[:2]
-        with np.errstate(all="ignore"):
-            # Ray and line in the plane: t directions = start + part along.
-            turn = directions[:, :1] * along[:, 1] - directions[:, 1:2] * along[:, 0]
-            t = (start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]) / turn
-            part = (start[:, 0] * directions[:, 1:2] - start[:, 1] * directions[:, :1]) / turn
-            t[~((t > 1e-6) & (part >= 0) & (part <= 1))] = np.inf
-            rays = np.arange(len(directions))
-            depth, solid = np.full(len(rays), np.inf), np.zeros(len(rays), bool)
-            for line in np.argsort(t, axis=1).T:  # those that each ray crosses, from near to far
-                at = t[rays, line]
-                crossed = np.isfinite(at) & np.isinf(depth)
-                if not crossed.any():
-                    break
-                back = (turn[rays, line] > 0).astype(int)
-                near, far = sector[line, back], sector[line, 1 - back]
-                height = origin[2] + directions[:, 2] * at
-                below, above = height < floor[near], height > ceiling[near]
-                over = (far >= 0) & (height > ceiling[far])
-                # Between two open skies there is no wall.
-                wall = (far < 0) | (height < floor[far]) | (over & ~(sky[near] & sky[far]))
-                ends = crossed & (below | above | over | wall)
-                flat = (np.where(below, floor[near], ceiling[near]) - origin[2]) / directions[:, 2]
-                depth[ends] = np.where(below | above, flat, at)[ends]
-                solid[ends] = np.where(above, ~sky[near], below | wall)[ends]
-        return depth, solid
-
-    @cached_property
-    def _walls(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of each line: start [L, 2], vector to its end [L, 2], and the sectors on its sides [L, 2], -1: none."""
-        lines, sides = self._rows("LINEDEFS", _LINE), self._rows("SIDEDEFS", _SIDE)
-        ends = self._rows("VERTEXES", _VERTEX)[lines["ends"]].astype(float)
-        facing = sides["sector"][np.minimum(lines["sides"], len(sides) - 1)].astype(int)
-        return ends[:, 0], ends[:, 1] - ends[:, 0], np.where(lines["sides"] == _NO_SIDE, -1, facing)
-
-    @cached_property
-    def _sectors(self) -> dict[str, np.ndarray]:
-        rows = self._rows("SECTORS", _SECTOR)
-        return {"floor": rows["floor"], "ceiling": rows["ceiling"], "sky": rows["flats"][:, 1] == b"F_SKY1"}
-
-    def _rows(self, lump: str, row: np.dtype) -> np.ndarray:
-        return np.frombuffer(self.lumps[lump], row)
 
 
 def steer(x: float, y: float, yaw: float, goal: np.ndarray) -> list[float]:
@@ -407,6 +288,8 @@ class Command:
     """What the player holds; freedoom1 has no SuperShotgun."""
     path: Annotated[tuple[str, ...], tyro.conf.arg(metavar="X,Y,YAW")] = WALK
     """Waypoints in the map's units, each with the direction to look in, degrees; the walk starts at the first."""
+    random_walk: int | None = None
+    """Walk where chance leads from the map's start, instead of along `path`; the number seeds it."""
     width: int = 800
     """Of a view, pixels; the game draws twice as many, in one of ViZDoom's resolutions."""
     height: int = 450
@@ -435,9 +318,10 @@ class Command:
                 raise InputError(f"views of {width} x {height} cannot be drawn", "800 x 450 or 640 x 480 can")
         if self.side == front:
             raise InputError("--side has the size of the first camera's views", "cameras are told apart by it")
-        waypoints, tics = self._waypoints(), round(TICS_PER_SECOND / self.views_per_second)
+        tics = round(TICS_PER_SECOND / self.views_per_second)
         wad = Path(self.wad) if self.wad.endswith(".wad") else Path(vzd.__path__[0]) / f"{self.wad}.wad"
         original = Map.read(wad, self.map)
+        waypoints = self._waypoints(original)
         world = original.static(waypoints[0])
         with staged_folder(self.output) as folder, TemporaryDirectory() as scratch:
             world.write(static := Path(scratch) / "static.wad")
@@ -454,7 +338,12 @@ class Command:
             for said in write_dataset(folder, world, recordings, self.quality):
                 print(f"{self.output}: {said}")
 
-    def _waypoints(self) -> np.ndarray:
+    def _waypoints(self, world: Map) -> np.ndarray:
+        if self.random_walk is not None:
+            if self.random_walk < 0 or (found := random_walk(world, self.random_walk)) is None:
+                problem = f"--random-walk {self.random_walk} leads nowhere in {self.map}"
+                raise InputError(problem, "choose another number, not negative")
+            return found
         try:
             waypoints = np.array([[float(value) for value in point.split(",")] for point in self.path])
             if waypoints.shape != (len(self.path), 3) or len(self.path) < 2 or not np.isfinite(waypoints).all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import subprocess
 import sys
@@ -12,7 +13,10 @@ import pytest
 from PIL import Image
 
 from benchmarks import record_game
-from benchmarks.record_game import Command, Map, Recording, camera_axes, steer, write_dataset
+from benchmarks.games import doom_map
+from benchmarks.games.doom_map import Map
+from benchmarks.games.random_walk import FAR, LENGTHS, MIN_STEPS, free_way, random_walk
+from benchmarks.record_game import Command, Recording, camera_axes, steer, write_dataset
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.errors import InputError
@@ -24,16 +28,16 @@ EYE = np.array([64.0, 128.0, 41.0])
 def rooms() -> Map:
     """Two rooms of 128 x 256: the left from 0 to 128 high, the right from 32 to 96 and open to the sky."""
     corners = np.array([[0, 0], [0, 256], [128, 256], [256, 256], [256, 0], [128, 0]], "<i2")
-    lines = np.zeros(7, record_game._LINE)
+    lines = np.zeros(7, doom_map.LINE)
     lines["ends"] = [[0, 1], [1, 2], [2, 3], [3, 4], [4, 5], [5, 0], [5, 2]]
     lines["special"] = 7
     lines["sides"] = [[0, 0xFFFF], [0, 0xFFFF], [1, 0xFFFF], [1, 0xFFFF], [1, 0xFFFF], [0, 0xFFFF], [1, 0]]
-    sides = np.zeros(2, record_game._SIDE)
+    sides = np.zeros(2, doom_map.SIDE)
     sides["sector"] = [0, 1]
-    sectors = np.zeros(2, record_game._SECTOR)
+    sectors = np.zeros(2, doom_map.SECTOR)
     sectors["floor"], sectors["ceiling"], sectors["special"] = [0, 32], [128, 96], 9
     sectors["flats"] = [[b"FLOOR0_1", b"CEIL1_1"], [b"FLOOR0_1", b"F_SKY1"]]
-    things = np.array([(10, 20, 90, 3004, 7), (32, 64, 45, 1, 7)], record_game._THING)
+    things = np.array([(10, 20, 90, 3004, 7), (32, 64, 45, 1, 7)], doom_map.THING)
     lumps = {"THINGS": things, "LINEDEFS": lines, "SIDEDEFS": sides, "VERTEXES": corners, "SECTORS": sectors}
     others = dict.fromkeys(("SEGS", "SSECTORS", "NODES", "REJECT", "BLOCKMAP"), b"abc")
     return Map("MAP01", {name: lump.tobytes() for name, lump in lumps.items()} | others)
@@ -67,8 +71,8 @@ def test_a_map_is_written_and_read_and_static_it_keeps_its_walls_alone(rooms, tm
     assert read.start == "32,64,45"
     static = read.static(np.array([50.4, 60.0, 90.0]))
     assert static.start == "50,60,90"
-    assert len(static.lumps["THINGS"]) == record_game._THING.itemsize
-    for lump, row in (("LINEDEFS", record_game._LINE), ("SECTORS", record_game._SECTOR)):
+    assert len(static.lumps["THINGS"]) == doom_map.THING.itemsize
+    for lump, row in (("LINEDEFS", doom_map.LINE), ("SECTORS", doom_map.SECTOR)):
         before, after = np.frombuffer(rooms.lumps[lump], row), np.frombuffer(static.lumps[lump], row)
         assert not after["special"].any()
         for name in set(row.names or ()) - {"special"}:
@@ -82,6 +86,41 @@ def test_a_file_or_map_that_is_not_there_is_named(rooms, tmp_path):
         Map.read(tmp_path / "rooms.wad", "E1M1")
     with pytest.raises(InputError, match=r"nowhere\.wad is no WAD file"):
         Map.read(tmp_path / "nowhere.wad", "MAP01")
+
+
+def _enlarged(world: Map, factor: float) -> Map:
+    """The same rooms, so many times as wide."""
+    corners = factor * np.frombuffer(world.lumps["VERTEXES"], "<i2")
+    return Map(world.name, world.lumps | {"VERTEXES": corners.astype("<i2").tobytes()})
+
+
+def test_the_floor_is_that_of_the_room_and_a_step_too_high_ends_the_way(rooms):
+    assert rooms.floor(64, 128) == 0
+    assert rooms.floor(192, 128) == 32
+    assert free_way(rooms, 64, 128, 0, 0) == pytest.approx(64)  # the step to the right room
+    assert free_way(rooms, 192, 128, 32, 180) == pytest.approx(192)  # down it goes on
+    assert free_way(rooms, 64, 128, 0, 90) == pytest.approx(128)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_random_walk_has_a_free_way_from_each_waypoint_to_the_next(rooms, seed):
+    hall = _enlarged(rooms, 8)
+    walk = random_walk(hall, seed)
+    assert walk is not None
+    assert len(walk) > MIN_STEPS
+    assert np.array_equal(walk, np.asarray(random_walk(hall, seed)))
+    for (x, y, _), (there_x, there_y, _) in itertools.pairwise(walk):
+        toward = np.degrees(np.arctan2(there_y - y, there_x - x))
+        distance = np.hypot(there_x - x, there_y - y)
+        assert 49 < distance < LENGTHS[1] + 1
+        assert free_way(hall, x, y, hall.floor(x, y), toward) > distance
+        assert hall.floor(there_x, there_y) == 0  # the other room is too high
+    sights = [free_way(hall, x, y, 0, look) for x, y, look in walk[1:]]
+    assert np.median(sights) > FAR / 2
+
+
+def test_a_random_walk_that_ends_in_a_corner_is_none(rooms):
+    assert random_walk(_enlarged(rooms, 0.5), 0) is None
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -149,6 +188,7 @@ def test_a_rig_has_a_folder_a_lens_and_masks_for_each_camera(rooms, tmp_path):
         (["--width", "700"], "views of 700 x 450 cannot be drawn"),
         (["--path", "0,0,0", "1,2"], "--path 0,0,0 1,2: "),
         (["--map", "E1M1"], "has no map E1M1"),
+        (["--random-walk", "-1"], "--random-walk -1 leads nowhere in MAP01"),
         (["--path", "-192,-192,0", "5000,5000,0"], "in MAP01 the game starts players at -192,-192,0"),
     ],
 )
