@@ -29,4 +29,7 @@ def changing_area(estimate: LayerEstimate) -> np.ndarray:
     labels = cv2.connectedComponents(opened, connectivity=8)[1].ravel().astype(np.intp)
     hidden = np.bincount(labels, weights=opacity.ravel()) / np.bincount(labels)
     kept = (opened > 0) & (hidden[labels] > MIN_MEAN_OPACITY).reshape(opened.shape)
+    # What sways, sways as a whole; where it is plain, nothing is unusual.
+    whole = cv2.connectedComponents((opacity > MIN_MEAN_OPACITY).astype(np.uint8), connectivity=8)[1]
+    kept |= np.isin(whole, np.setdiff1d(whole[kept], 0))
     return cv2.dilate(kept.astype(np.uint8), _NEIGHBORS, iterations=2) > 0

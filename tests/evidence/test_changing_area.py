@@ -33,6 +33,17 @@ def test_an_artifact_that_the_layers_do_not_explain_changes_and_its_rim_belongs_
     assert (found == expected).all()
 
 
+def test_what_changes_in_a_part_changes_as_a_whole_but_for_what_lets_most_of_the_scene_through() -> None:
+    part = estimated(0.8, 0.4)
+    part.unexplained[24:36, 26:34] = 0.05  # plain: it looks the same wherever it is
+    assert (changing_area(part) == changing_area(estimated(0.8, 0.4))).all()
+    part.transmittance[24:36, 30:34] = 0.6
+    part.transmittance[4:12, 44:56] = 0.2  # another one, which stands still
+    expected = np.zeros((HEIGHT, WIDTH), bool)
+    expected[22:38, 18:32] = True
+    assert (changing_area(part) == expected).all()
+
+
 @pytest.mark.parametrize(
     ("opacity", "unexplained"),
     [(0.8, 0.05), (0.3, 0.4), (0.05, 0.4), (0.0, 0.0)],
