@@ -334,15 +334,20 @@ class Command:
                     recordings.append(_record(aside, waypoints + np.array([0, 0, ASIDE]), tics, "side"))
             except Stuck as stuck:
                 remedy = f"walk around it; in {self.map} the game starts players at {original.start}"
+                remedy = remedy if self.random_walk is None else "choose another --random-walk"
                 raise InputError(str(stuck), remedy) from stuck
             for said in write_dataset(folder, world, recordings, self.quality):
                 print(f"{self.output}: {said}")
 
     def _waypoints(self, world: Map) -> np.ndarray:
         if self.random_walk is not None:
-            if self.random_walk < 0 or (found := random_walk(world, self.random_walk)) is None:
+            if self.path != WALK:
+                raise InputError("--path and --random-walk were both given", "leave one of them out")
+            if self.random_walk < 0:
+                raise InputError(f"--random-walk must be 0 or more, got {self.random_walk}")
+            if (found := random_walk(world, self.random_walk)) is None:
                 problem = f"--random-walk {self.random_walk} leads nowhere in {self.map}"
-                raise InputError(problem, "choose another number, not negative")
+                raise InputError(problem, "choose another number, or another --map")
             return found
         try:
             waypoints = np.array([[float(value) for value in point.split(",")] for point in self.path])

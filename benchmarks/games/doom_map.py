@@ -51,9 +51,16 @@ class Map:
 
     @property
     def start(self) -> str:
-        """Where the game starts a player, as a waypoint."""
+        """Where the game starts a player, as a waypoint.
+
+        Raises:
+            InputError: nowhere.
+        """
         things = self._rows("THINGS", THING)
-        return ",".join(str(value) for value in things[things["kind"] == _PLAYER][0].item()[:3])
+        players = things[things["kind"] == _PLAYER]
+        if not len(players):
+            raise InputError(f"{self.name} has no start of a player", "choose another map")
+        return ",".join(str(value) for value in players[0].item()[:3])
 
     def static(self, start: np.ndarray) -> Map:
         """The map with the player its only thing, in which nothing moves, opens, flickers or hurts.
@@ -75,17 +82,19 @@ class Map:
             body += lump
         path.write_bytes(struct.pack("<4sii", b"PWAD", len(self.lumps) + 1, 12 + len(body)) + body + entries)
 
-    def trace(self, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def trace(self, origin: np.ndarray, directions: np.ndarray, walking: bool = False) -> tuple[np.ndarray, np.ndarray]:
         """Follow rays to the first wall, floor or ceiling. The game's own depth has 8 bits, this none to spare.
 
         Args:
             origin: [3], inside a sector.
             directions: [N, 3], not vertical.
+            walking: whether rays also end at lines that let pictures through and no player.
 
         Returns:
             Depth [N] in multiples of the directions, and whether it is a surface [N]: not where a ray ends in the sky.
         """
         sector = self._walls[2]
+        closed = self._impassable if walking else np.zeros(len(sector), bool)
         floor, ceiling, sky = (self._sectors[key] for key in ("floor", "ceiling", "sky"))
         t, turn = self._crossings(origin, directions)
         rays = np.arange(len(directions))
@@ -102,7 +111,7 @@ class Map:
                 below, above = height < floor[near], height > ceiling[near]
                 over = (far >= 0) & (height > ceiling[far])
                 # Between two open skies there is no wall.
-                wall = (far < 0) | (height < floor[far]) | (over & ~(sky[near] & sky[far]))
+                wall = (far < 0) | closed[line] | (height < floor[far]) | (over & ~(sky[near] & sky[far]))
                 ends = crossed & (below | above | over | wall)
                 flat = (np.where(below, floor[near], ceiling[near]) - origin[2]) / directions[:, 2]
                 depth[ends] = np.where(below | above, flat, at)[ends]
@@ -144,6 +153,11 @@ class Map:
         ends = self._rows("VERTEXES", _VERTEX)[lines["ends"]].astype(float)
         facing = sides["sector"][np.minimum(lines["sides"], len(sides) - 1)].astype(int)
         return ends[:, 0], ends[:, 1] - ends[:, 0], np.where(lines["sides"] == _NO_SIDE, -1, facing)
+
+    @property
+    def _impassable(self) -> np.ndarray:
+        """Lines that no player crosses, [L]."""
+        return (self._rows("LINEDEFS", LINE)["flags"] & 1).astype(bool)
 
     @cached_property
     def _sectors(self) -> dict[str, np.ndarray]:

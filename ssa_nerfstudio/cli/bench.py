@@ -28,7 +28,7 @@ class Command:
     output: Path
     """Folder of the results; an earlier one is brought up to date, a finished run is never repeated."""
     benchmark: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="BENCHMARK")] = "smoke"
-    """smoke, captures, games, baselines, exposure, exposure-captures, lengths, captures-cpu, games-cpu, mipnerf360,
+    """smoke, captures, captures-cpu, games, games-cpu, baselines, exposure, exposure-captures, lengths, mipnerf360,
     two-pass, or a .yaml file."""
     scenes: tuple[str, ...] = ()
     """Only these scenes."""

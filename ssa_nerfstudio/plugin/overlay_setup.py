@@ -278,7 +278,8 @@ def _in_words(detection: Detection, share: float, name: str, known: str = "") ->
     reason = "too few to tell" if detection.views < MIN_VIEWS else "as many static edges as chance has"
     reason = "some edges stand still, but too few to be one" if detection.too_few_edges else reason
     if share >= 0.001:
-        reason += f"; {share:.1%} of the frame seems hidden or lit, {MIN_SHARE:.0%} would count"
+        # Rounded down: what is said to count would be an artifact.
+        reason += f"; {int(1000 * share) / 1000:.1%} of the frame seems hidden or lit, {MIN_SHARE:.0%} would count"
     text = (
         f"{name} show no static artifact ({counted(detection.views, 'view')}, {reason}): training without an overlay. "
         "(--pipeline.model.overlay on trains with one.)"

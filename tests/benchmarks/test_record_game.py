@@ -6,16 +6,17 @@ import itertools
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from games import doom_map
+from games.doom_map import Map
+from games.random_walk import FAR, LENGTHS, MARGIN, MIN_STEPS, free_way, random_walk
 from PIL import Image
 
 from benchmarks import record_game
-from benchmarks.games import doom_map
-from benchmarks.games.doom_map import Map
-from benchmarks.games.random_walk import FAR, LENGTHS, MIN_STEPS, free_way, random_walk
 from benchmarks.record_game import Command, Recording, camera_axes, steer, write_dataset
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.sparse_points import check_points
@@ -80,6 +81,11 @@ def test_a_map_is_written_and_read_and_static_it_keeps_its_walls_alone(rooms, tm
     assert list(static.lumps) == list(rooms.lumps)
 
 
+def test_a_map_without_a_player_is_named(rooms):
+    with pytest.raises(InputError, match="MAP01 has no start of a player; choose another map"):
+        _ = _changed(rooms, "THINGS", lambda things: things["kind"].fill(3004)).start
+
+
 def test_a_file_or_map_that_is_not_there_is_named(rooms, tmp_path):
     rooms.write(tmp_path / "rooms.wad")
     with pytest.raises(InputError, match=r"has no map E1M1; choose one of MAP01"):
@@ -94,27 +100,42 @@ def _enlarged(world: Map, factor: float) -> Map:
     return Map(world.name, world.lumps | {"VERTEXES": corners.astype("<i2").tobytes()})
 
 
+def _changed(world: Map, lump: str, change: Callable[[np.ndarray], object]) -> Map:
+    """With other rows of a lump."""
+    row = {"LINEDEFS": doom_map.LINE, "SECTORS": doom_map.SECTOR, "THINGS": doom_map.THING}[lump]
+    rows = np.frombuffer(world.lumps[lump], row).copy()
+    change(rows)
+    return Map(world.name, world.lumps | {lump: rows.tobytes()})
+
+
 def test_the_floor_is_that_of_the_room_and_a_step_too_high_ends_the_way(rooms):
     assert rooms.floor(64, 128) == 0
     assert rooms.floor(192, 128) == 32
     assert free_way(rooms, 64, 128, 0, 0) == pytest.approx(64)  # the step to the right room
     assert free_way(rooms, 192, 128, 32, 180) == pytest.approx(192)  # down it goes on
     assert free_way(rooms, 64, 128, 0, 90) == pytest.approx(128)
+    low = _changed(rooms, "SECTORS", lambda sectors: sectors.__setitem__(1, (8, 50, *list(sectors[1])[2:])))
+    assert free_way(low, 64, 128, 0, 0) == pytest.approx(64)  # a player would have to duck
+    closed = _changed(rooms, "LINEDEFS", lambda lines: lines["flags"].__setitem__(6, 1))
+    assert free_way(closed, 192, 128, 32, 180) == pytest.approx(64)
+    assert closed.trace(np.array([192, 128, 73.0]), np.array([[-1.0, 0, 0]]))[0][0] == pytest.approx(192)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_random_walk_has_a_free_way_from_each_waypoint_to_the_next(rooms, seed):
-    hall = _enlarged(rooms, 8)
+    # The other room is low enough to be climbed into, and too high for a step.
+    hall = _changed(_enlarged(rooms, 8), "SECTORS", lambda sectors: sectors["floor"].__setitem__(1, 22))
     walk = random_walk(hall, seed)
     assert walk is not None
     assert len(walk) > MIN_STEPS
     assert np.array_equal(walk, np.asarray(random_walk(hall, seed)))
+    assert not np.array_equal(walk, np.asarray(random_walk(hall, seed + 1)))
     for (x, y, _), (there_x, there_y, _) in itertools.pairwise(walk):
         toward = np.degrees(np.arctan2(there_y - y, there_x - x))
         distance = np.hypot(there_x - x, there_y - y)
-        assert 49 < distance < LENGTHS[1] + 1
+        assert MARGIN - 1 < distance < LENGTHS[1] + 1
         assert free_way(hall, x, y, hall.floor(x, y), toward) > distance
-        assert hall.floor(there_x, there_y) == 0  # the other room is too high
+        assert hall.floor(there_x, there_y) == 0
     sights = [free_way(hall, x, y, 0, look) for x, y, look in walk[1:]]
     assert np.median(sights) > FAR / 2
 
@@ -188,7 +209,9 @@ def test_a_rig_has_a_folder_a_lens_and_masks_for_each_camera(rooms, tmp_path):
         (["--width", "700"], "views of 700 x 450 cannot be drawn"),
         (["--path", "0,0,0", "1,2"], "--path 0,0,0 1,2: "),
         (["--map", "E1M1"], "has no map E1M1"),
-        (["--random-walk", "-1"], "--random-walk -1 leads nowhere in MAP01"),
+        (["--random-walk", "-1"], "--random-walk must be 0 or more, got -1"),
+        (["--random-walk", "0", "--map", "MAP20"], "--random-walk 0 leads nowhere in MAP20; choose another number, or"),
+        (["--random-walk", "0", "--path", "0,0,0", "9,9,0"], "--path and --random-walk were both given"),
         (["--path", "-192,-192,0", "5000,5000,0"], "in MAP01 the game starts players at -192,-192,0"),
     ],
 )

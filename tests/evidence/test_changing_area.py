@@ -44,6 +44,12 @@ def test_what_changes_in_a_part_changes_as_a_whole_but_for_what_lets_most_of_the
     assert (changing_area(part) == expected).all()
 
 
+def test_what_changes_may_let_most_of_the_scene_through_in_places() -> None:
+    soft = estimated(0.8, 0.4)
+    soft.transmittance[24:36, 20:22] = 0.6
+    assert (changing_area(soft) == changing_area(estimated(0.8, 0.4))).all()
+
+
 @pytest.mark.parametrize(
     ("opacity", "unexplained"),
     [(0.8, 0.05), (0.3, 0.4), (0.05, 0.4), (0.0, 0.0)],

@@ -24,6 +24,7 @@ NOT_RADIAL = {
     "a watermark in the middle": 1 + 2 * torch.sigmoid((0.15 - torch.hypot(X, Y)) / 0.02),
     "a large one": 1 + 2 * torch.sigmoid((0.3 - torch.hypot(X, Y)) / 0.05),
     "a soft one": 1 + 2 * torch.sigmoid((0.4 - torch.hypot(X, Y)) / 0.1),
+    "light of one corner and its opposite, and less outside": (1 - 0.3 * (X**2 + Y**2)) * (1 - 0.8 * X * Y),
     "a finger": 0.2 + 0.8 * torch.sigmoid((torch.hypot(X - 0.7, Y - 0.5) - 0.4) / 0.05),
 }
 
