@@ -183,7 +183,7 @@ def test_too_few_static_edges_are_called_that(tiny_scene, tmp_path, capsys, monk
     ("rows", "columns", "said"),
     [
         (0, 64, "show no static artifact (12 views, as many static edges as chance has):"),
-        (1, 30, "as many static edges as chance has; 1.0% of the frame seems hidden or lit, 2% would count):"),
+        (1, 30, "as many static edges as chance has; 0.9% of the frame seems hidden or lit, 2% would count):"),
         (2, 64, "have a static artifact (soft, 4.2% of the undistorted frame)"),
     ],
 )
