@@ -154,7 +154,7 @@ class Map:
         facing = sides["sector"][np.minimum(lines["sides"], len(sides) - 1)].astype(int)
         return ends[:, 0], ends[:, 1] - ends[:, 0], np.where(lines["sides"] == _NO_SIDE, -1, facing)
 
-    @property
+    @cached_property
     def _impassable(self) -> np.ndarray:
         """Lines that no player crosses, [L]."""
         return (self._rows("LINEDEFS", LINE)["flags"] & 1).astype(bool)
