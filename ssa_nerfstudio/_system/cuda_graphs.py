@@ -101,10 +101,9 @@ class RecordedFunction:
         Args:
             function: of the inputs and the parameters.
             inputs: with the shapes, types and needs of a gradient of all later calls.
-            parameters: they must stay where they are.
+            parameters: they, or others in their place, must stay where they are.
             record: `CapturedPrograms`, or what repeats programs on a CPU in a test.
         """
-        self._parameters = tuple(parameters)
         self.calls = 0
         self._inputs = [each.detach().clone().requires_grad_(each.requires_grad) for each in inputs]
         # Under other names, because autograd would wait for the stream on which a parameter was used before.
@@ -136,9 +135,13 @@ class RecordedFunction:
         self._gradients = [next(of_leaves) if each.requires_grad else None for each in arguments]
         computed.clear()
 
-    def __call__(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        """The function's values, connected to inputs and parameters by autograd."""
-        return _Repeated.apply(self, *inputs, *self._parameters)  # pyright: ignore[reportReturnType]
+    def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
+        """The function's values, connected by autograd to the inputs and parameters that are given.
+
+        Parameters may be other objects than those that were recorded: gsplat's relocation puts new ones around the same
+        memory.
+        """
+        return _Repeated.apply(self, *tensors)  # pyright: ignore[reportReturnType]
 
     def values(self, inputs: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
         """All values for given inputs, and those of them that have no gradient."""
@@ -229,7 +232,7 @@ class RecordedCalls:
                 self._failed, self._known = True, {}
                 _warn(error)
                 return function(*inputs, *parameters)
-        return recorded(*inputs)
+        return recorded(*inputs, *parameters)
 
     def forget(self) -> None:
         """Drop all recordings, and with them their memory and the parameters that they were made of."""

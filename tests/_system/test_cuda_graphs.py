@@ -46,14 +46,16 @@ def outcome(function, mixture: Mixture, inputs: list[Tensor], slope: float) -> l
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_a_recorded_function_has_the_values_and_gradients_of_the_plain_one(device):
     mixture = Mixture(device)
-    recorded = RecordedFunction(mixture, mixture.inputs(), [mixture.weights, mixture.unused], recorder(device)())
+    parameters = [mixture.weights, mixture.unused]
+    recorded = RecordedFunction(mixture, mixture.inputs(), parameters, recorder(device)())
     for step in range(3):
         with torch.no_grad():
             mixture.weights.add_(0.1)  # as an optimizer does, in place
         inputs = mixture.inputs()
         for slope in (1.0, 2.0 + step):
             torch.testing.assert_close(
-                outcome(recorded, mixture, inputs, slope), outcome(mixture, mixture, inputs, slope)
+                outcome(lambda *given: recorded(*given, *parameters), mixture, inputs, slope),
+                outcome(mixture, mixture, inputs, slope),
             )
     assert mixture.unused.grad is None
 
@@ -63,10 +65,10 @@ def test_a_value_that_nothing_depends_on_has_no_slope(device):
     mixture = Mixture(device)
     inputs = mixture.inputs()
     recorded = RecordedFunction(mixture, inputs, [mixture.weights], recorder(device)())
-    for function in (recorded, recorded):  # the second follows a call whose sums had a slope
-        outcome(function, mixture, inputs, 1.0)
+    for _ in range(2):  # the second follows a call whose sums had a slope
+        outcome(lambda *given: recorded(*given, mixture.weights), mixture, inputs, 1.0)
         mixture.weights.grad = None
-        function(*inputs)[0].backward()
+        recorded(*inputs, mixture.weights)[0].backward()
         assert mixture.weights.grad is not None
         found, mixture.weights.grad = mixture.weights.grad.clone(), None
         mixture(*inputs)[0].backward()
@@ -77,8 +79,8 @@ def test_a_gradient_after_another_call_is_refused():
     mixture = Mixture("cpu")
     inputs = mixture.inputs()
     recorded = RecordedFunction(mixture, inputs, [mixture.weights], run_again())
-    first = recorded(*inputs)[0]
-    recorded(*inputs)
+    first = recorded(*inputs, mixture.weights)[0]
+    recorded(*inputs, mixture.weights)
     with pytest.raises(RuntimeError, match="called again"):
         first.backward()
 
@@ -118,6 +120,20 @@ def test_every_kind_is_recorded_at_its_second_call_and_anew_in_another_epoch(dev
     assert [call("a", 1) for _ in range(3)] == [0, 2, 0]
     mixture.weights.data = mixture.weights.data.clone()  # as a refinement does
     assert [call("a", 1) for _ in range(3)] == [0, 2, 0]
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_gradients_reach_a_parameter_that_took_anothers_place_in_memory(device):
+    """As gsplat's relocation does: new parameters around the same numbers."""
+    mixture = Mixture(device)
+    calls = RecordedCalls(recorder(device))
+    inputs = mixture.inputs()
+    for _ in range(3):
+        found = outcome(lambda *given: calls(mixture, given, [mixture.weights], "kind"), mixture, inputs, 1.0)
+        former, mixture.weights = mixture.weights, torch.nn.Parameter(mixture.weights.data)
+        assert former.data_ptr() == mixture.weights.data_ptr()
+    assert found[-1] is not None
+    torch.testing.assert_close(found, outcome(mixture, mixture, inputs, 1.0))
 
 
 def test_gradients_accumulate_as_without_recordings():

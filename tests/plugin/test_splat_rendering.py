@@ -97,6 +97,8 @@ def test_a_training_view_is_gsplats_with_the_same_gradients(monkeypatch, sh_degr
                 value += 0.01 * torch.randn_like(value)
         if view == 3:  # as a refinement does
             given = {name: torch.nn.Parameter(value.detach()[::2].clone()) for name, value in given.items()}
+        if view == 5:  # as gsplat's relocation does, in the same memory
+            given = {name: torch.nn.Parameter(value.data) for name, value in given.items()}
     assert [each is not None for each in renderer.projections._known.values()] == ([] if graphs == "0" else [True])
 
 
@@ -142,11 +144,15 @@ def test_recordings_of_fewer_gaussians_are_given_up_once_there_are_too_many_to_r
     monkeypatch.setattr(splat_rendering, "MOST_RECORDED", 50)
     renderer = SplatRenderer("cpu")
     renderer.projections = RecordedCalls(run_again)
+
+    def double(parameter: Tensor) -> tuple[Tensor, ...]:
+        return (2 * parameter,)
+
     former = torch.nn.Parameter(torch.ones(3))
     for _ in range(2):
-        renderer.projections(lambda parameter: (2 * parameter,), [], [former], "kind")
-    kept = weakref.ref(former)
-    del former
+        renderer.projections(double, [], [former], "kind")
+    kept = weakref.ref(double)  # as long as its recording
+    del double
     outcome(renderer, parameters(50, "cpu"), 0, 3, "classic")
     gc.collect()
     assert kept() is not None
