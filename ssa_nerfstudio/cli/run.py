@@ -49,10 +49,13 @@ class Command:
     """A folder of photos or videos, a rig's folder with a subfolder for each camera, one video, or a dataset."""
     output: Path
     """Folder for report.html, splats.ply, splats-compressed.ply, artifact.png, matte.png and the training's run."""
-    method: Literal["ssa-splatfacto", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"] = "ssa-splatfacto"
-    """What to train."""
+    method: Literal["ssa-splatfacto", "ssa-splatfacto-fast", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"] = (
+        "ssa-splatfacto"
+    )
+    """What to train; -fast: ssa-splatfacto in fewer steps."""
     steps: int | None = None
-    """Training steps; schedules are scaled to them. Default: 30000 with a GPU, 2000 without."""
+    """Training steps; schedules are scaled to them. Default: the method's own with a GPU (15000; -fast 4000,
+    -paper 30000), 2000 without."""
     forwarded: tyro.conf.Suppress[tuple[tuple[str, ...], ...]] = ((),) * len(STAGES)
     """What followed --detect., --process. and --train., as options of those commands."""
 
@@ -167,7 +170,7 @@ class Command:
                 if source.faces:
                     console.print(typed_for_run(cut_into_faces(source), "process"), markup=False)
         cameras = read_cameras(self.photos, detection.frames)
-        steps, scale, warnings = choose_length_and_scale(longest, self.steps)
+        steps, scale, warnings = choose_length_and_scale(longest, self.steps, METHODS[self.method].max_num_iterations)
         choices = Choices(self.photos, self.method, steps, scale, *self.forwarded)
         with errors_for_run("train"):
             config = arguments.read(

@@ -17,10 +17,8 @@ from ssa_nerfstudio.sfm.ingest import MAX_TRAINING_SIZE
 from ssa_nerfstudio.workflow.finished_training import Evaluation
 from ssa_nerfstudio.workflow.photos_to_splats import DATASET, TRAINING
 
-STEPS = 30_000
-"""Steps of a training on a GPU: splatfacto's."""
 CPU_STEPS = 2_000
-"""Steps of a training without one: tens of minutes on two cores."""
+"""Steps of a training without a GPU: tens of minutes on two cores."""
 CPU_SIZE = 640
 """Longest side of the photos that a training without a GPU sees, pixels."""
 _DATAPARSER = "--nerfstudio-data."
@@ -118,18 +116,19 @@ def is_dataset(photos: Path) -> bool:
     return photos.suffix == ".json" or (photos / "transforms.json").is_file()
 
 
-def choose_length_and_scale(longest: int, steps: int | None) -> tuple[int, float, tuple[str, ...]]:
+def choose_length_and_scale(longest: int, steps: int | None, of_method: int) -> tuple[int, float, tuple[str, ...]]:
     """Choose how long to train and at which size, for the machine that this is.
 
     Args:
         longest: side of a photo, pixels.
         steps: what the user asked for.
+        of_method: steps of the method's configuration, for a GPU.
 
     Returns:
         The steps, the factor by which photos are resized, and what the user should know about them.
     """
     if torch.cuda.is_available():
-        return steps or STEPS, 1.0, ()
+        return steps or of_method, 1.0, ()
     trained = longest
     while trained > MAX_TRAINING_SIZE:  # nerfstudio trains on copies of half the size
         trained //= 2
@@ -138,7 +137,7 @@ def choose_length_and_scale(longest: int, steps: int | None) -> tuple[int, float
         return steps, scale, ()
     text = (
         f"without a GPU, training takes {counted(steps or CPU_STEPS, 'step')} on photos of at most "
-        f"{round(scale * trained)} pixels; with one, the same command takes {STEPS:,} steps on all pixels, which is "
-        "sharper"
+        f"{round(scale * trained)} pixels; with one, the same command takes {of_method:,} steps on all pixels, "
+        "which is sharper"
     )
     return steps or CPU_STEPS, scale, (text,)

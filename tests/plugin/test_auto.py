@@ -22,7 +22,7 @@ from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin import overlay_setup
-from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
+from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 
@@ -217,9 +217,9 @@ def test_a_constant_start_looks_at_no_photo(tiny_scene, tmp_path, configure_trai
 
 
 def test_auto_is_the_default_except_for_the_papers_protocol():
-    methods: list[Any] = [spec.config for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)]
-    settings = {config.method_name: config.pipeline.model.overlay for config in methods}
-    assert settings == {"ssa-splatfacto": "auto", "ssa-splatfacto-mcmc": "auto", "ssa-splatfacto-paper": "on"}
+    settings = {name: config.pipeline.model.overlay for name, config in METHODS.items()}
+    assert settings.pop("ssa-splatfacto-paper") == "on"
+    assert set(settings.values()) == {"auto"}
 
 
 def test_resuming_without_an_overlay_cannot_force_one(clean_scene, tmp_path, configure_training, train_and_evaluate):

@@ -232,7 +232,7 @@ def test_the_viewer_serves_a_trained_model(config):
         viewer.wait()
 
 
-def test_nerfstudio_finds_the_three_methods():
+def test_nerfstudio_finds_the_methods():
     found = {script.name for script in entry_points(group="nerfstudio.method_configs")}
-    assert found == {"ssa-splatfacto", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"}
+    assert found == {"ssa-splatfacto", "ssa-splatfacto-fast", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"}
     assert found <= all_methods.keys()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,12 +16,8 @@ from PIL import Image
 
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.methods import ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper
+from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.training.schedules import scaled
-
-METHODS: dict[str, Any] = {
-    str(spec.config.method_name): spec.config for spec in (ssa_splatfacto, ssa_splatfacto_mcmc, ssa_splatfacto_paper)
-}
 
 
 @pytest.fixture(scope="session")
@@ -311,6 +306,13 @@ def test_a_shorter_run_is_seen_too(steps, stated, between):
 def test_every_optimizer_is_scale_free():
     for config in METHODS.values():
         assert all(entry["optimizer"].eps == 1e-15 for entry in config.optimizers.values())
+
+
+def test_a_preset_is_the_default_in_fewer_steps():
+    default, fast = METHODS["ssa-splatfacto"], copy.deepcopy(METHODS["ssa-splatfacto-fast"])
+    assert fast.max_num_iterations < default.max_num_iterations
+    fast.method_name, fast.max_num_iterations = default.method_name, default.max_num_iterations
+    assert fast == default
 
 
 def test_the_papers_protocol_is_what_the_paper_says():
