@@ -18,16 +18,20 @@ import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, sa
 import pycolmap
 
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
+from ssa_nerfstudio.sfm import square_pixels
+from ssa_nerfstudio.sfm.false_joins import rejoin, torn_links
 from ssa_nerfstudio.sfm.held_lens import map_with_held_lens, most_registered
 from ssa_nerfstudio.sfm.image_pairs import EXHAUSTIVE_UP_TO, exhaustive_pairs, sequential_pairs
 from ssa_nerfstudio.sfm.known_poses import align, triangulate
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
-from ssa_nerfstudio.sfm.reconstruction import JOB, KEPT, MODEL, Mount, Pass, SfmSettings
+from ssa_nerfstudio.sfm.reconstruction import JOB, KEPT, MODEL, TORN, Mount, Pass, SfmSettings
 from ssa_nerfstudio.sfm.registration import better, is_complete
 
 _PAIRS_PER_CALL = 64
 """Pairs that are matched and stored at once: the loss when the process is killed, and the grain of the progress bar."""
 _PHOTOS_PER_THREAD = 2
+_MAX_REJOINS = 3
+"""Times that a model is cut and joined again."""
 
 pycolmap.logging.minloglevel = 3
 
@@ -124,20 +128,31 @@ class StructureFromMotion:
         (self._folder / KEPT).write_text(json.dumps(sorted(kept)), encoding="utf-8")
         rigs = {number if each.mount is None else each.mount.rig for number, each in enumerate(self._passes)}
         at_once = len(self._passes) // len(rigs)
-        registered = len(kept) or 2 * at_once
 
-        def on_registered() -> None:
-            nonlocal registered
-            registered += at_once
-            on_progress("poses", min(registered, total), total)
+        def mapped(into: str) -> pycolmap.Reconstruction | None:
+            registered = len(kept) or 2 * at_once
+
+            def on_registered() -> None:
+                nonlocal registered
+                registered += at_once
+                on_progress("poses", min(registered, total), total)
+
+            (folder := models / into).mkdir()
+            found = pycolmap.incremental_mapping(
+                *(self._database, self._images, folder, self._mapping_options(total)),
+                input_path=start if kept else "",
+                next_image_callback=on_registered,
+            )
+            return most_registered(found)
 
         on_progress("poses", 0, total)
-        found = pycolmap.incremental_mapping(
-            *(self._database, self._images, models, self._mapping_options(total)),
-            input_path=start if kept else "",
-            next_image_callback=on_registered,
-        )
-        model = most_registered(found)
+        model, guess_all = None, not poses and all(each.lens is None for each in self._passes)
+        if guess_all and self._settings.camera_model == "OPENCV":
+            square_pixels.hold(self._database)
+            model = mapped("square")
+            square_pixels.free(self._database)
+        if not is_complete(model, total):
+            model = better(model, mapped("free"))
         free = [number for number, each in enumerate(self._passes, 1) if each.mount is None]
         if not kept and free and not is_complete(model, total):
             guessed = [number for number in free if not self._is_lens_known(number)]
@@ -145,16 +160,47 @@ class StructureFromMotion:
             again = count(1)
             other = map_with_held_lens(
                 *(self._database, self._images, models / "held", lambda: self._mapping_options(total)),
-                *(guessed, model, lambda: on_progress("other lenses", next(again) * at_once % total, total)),
+                *(guessed, model and square_pixels.with_opencv_lenses(model)),
+                lambda: on_progress("other lenses", next(again) * at_once % total, total),
             )
             on_progress("other lenses", total, total)
             model = better(model, other)
         if model is not None:
+            if is_square := square_pixels.are_held(model):
+                square_pixels.hold(self._database)
+            if not kept:
+                model = self._joined_again(model, models, total)
+            if is_square:
+                square_pixels.free(self._database)
+                model = square_pixels.refined(square_pixels.with_opencv_lenses(model), self._settings.threads)
+            (self._folder / TORN).write_text(json.dumps(torn_links(self._database, model)), encoding="utf-8")
             if kept:
                 align(model, {name: poses[name] for name in kept})
             (self._folder / MODEL).mkdir()
             model.write_binary(self._folder / MODEL)
         on_progress("poses", total, total)
+
+    def _joined_again(self, model: pycolmap.Reconstruction, folder: Path, total: int) -> pycolmap.Reconstruction:
+        """The model, with parts of the photos where their strongest matches have them."""
+        torn = torn_links(self._database, model)
+        for number in range(_MAX_REJOINS):
+            if not torn:
+                break
+            start, out = folder / f"rejoined_{number}", folder / f"refined_{number}"
+            out.mkdir()
+            if not rejoin(self._database, self._images, model, start):
+                break
+            options = self._mapping_options(total)
+            found = most_registered(
+                pycolmap.incremental_mapping(self._database, self._images, out, options, input_path=start)
+            )
+            if found is None or better(found, model) is model:
+                break
+            left = torn_links(self._database, found)
+            if len(left) >= len(torn):
+                break
+            model, torn = found, left
+        return model
 
     def _mapping_options(self, total: int) -> pycolmap.IncrementalPipelineOptions:
         options = pycolmap.IncrementalPipelineOptions()

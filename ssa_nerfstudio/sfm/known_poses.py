@@ -14,7 +14,7 @@ import pycolmap
 MIN_AGREEING = 0.5
 """Share of a photo's matches that have to agree with its pose, and of the poses that have to be kept. By chance a
 quarter of the matches agree, of neighbors' up to two thirds."""
-_MAX_ERROR = 4.0
+MAX_ERROR = 4.0
 """Of a match, pixels from the epipolar line: what COLMAP lets pass when it verifies matches."""
 
 
@@ -47,6 +47,30 @@ def triangulate(database: Path, images: Path, poses: Mapping[str, np.ndarray], f
     return names
 
 
+def epipolar_errors(
+    model: pycolmap.Reconstruction,
+    photos: tuple[int, int],
+    matches: np.ndarray,
+    poses: Mapping[int, pycolmap.Rigid3d],
+) -> np.ndarray:
+    """How far matches [N, 2] of two photos are from the epipolar lines of their poses, pixels [N].
+
+    Args:
+        model: the photos and cameras.
+        photos: their numbers.
+        matches: numbers of the features that match.
+        poses: camera from world, by the number of the photo.
+    """
+    cameras = [model.cameras[model.image(number).camera_id] for number in photos]
+    here, there = (
+        camera.cam_from_img(np.array([model.image(number).points2D[at].xy for at in chosen]))
+        for number, camera, chosen in zip(photos, cameras, matches.T, strict=True)
+    )
+    essential = pycolmap.essential_matrix_from_pose(poses[photos[1]] * poses[photos[0]].inverse())
+    errors = np.sqrt(pycolmap.compute_squared_sampson_error(here, there, essential))
+    return errors * np.mean([camera.mean_focal_length() for camera in cameras])
+
+
 def _agreeing(
     database: pycolmap.Database, model: pycolmap.Reconstruction, poses: Mapping[int, pycolmap.Rigid3d]
 ) -> list[int]:
@@ -67,17 +91,10 @@ def _agreeing(
         both = pycolmap.pair_id_to_image_pair(pair)
         if not len(geometry.inlier_matches) or any(number not in place for number in both):
             continue
-        cameras = [model.cameras[model.image(number).camera_id] for number in both]
-        here, there = (
-            camera.cam_from_img(np.array([model.image(number).points2D[at].xy for at in chosen]))
-            for number, camera, chosen in zip(both, cameras, geometry.inlier_matches.T, strict=True)
-        )
-        essential = pycolmap.essential_matrix_from_pose(poses[both[1]] * poses[both[0]].inverse())
-        errors = np.sqrt(pycolmap.compute_squared_sampson_error(here, there, essential))
-        focal = np.mean([camera.mean_focal_length() for camera in cameras])
+        errors = epipolar_errors(model, both, geometry.inlier_matches, poses)
         at = (place[both[0]], place[both[1]])
         matches[at] = matches[at[::-1]] = len(errors)
-        agreeing[at] = agreeing[at[::-1]] = (errors * focal <= _MAX_ERROR).sum()
+        agreeing[at] = agreeing[at[::-1]] = (errors <= MAX_ERROR).sum()
     kept = np.ones(len(numbers), dtype=bool)
     while kept.any():
         share = agreeing[:, kept].sum(axis=1) / np.maximum(matches[:, kept].sum(axis=1), 1)

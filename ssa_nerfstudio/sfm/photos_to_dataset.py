@@ -24,7 +24,7 @@ from ssa_nerfstudio.sfm.ingest import Photo, expected_count, ingest
 from ssa_nerfstudio.sfm.model_repair import Repair
 from ssa_nerfstudio.sfm.nerfstudio_dataset import write_dataset
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
-from ssa_nerfstudio.sfm.reconstruction import KEPT, Pass, SfmSettings, reconstruct
+from ssa_nerfstudio.sfm.reconstruction import KEPT, TORN, Pass, SfmSettings, reconstruct
 from ssa_nerfstudio.sfm.registration import (
     PassRegistration,
     better,
@@ -33,6 +33,7 @@ from ssa_nerfstudio.sfm.registration import (
     is_complete,
     registrations,
     warn_of_equal_cameras,
+    warn_of_false_joins,
 )
 from ssa_nerfstudio.sfm.work_folder import resumable_work
 
@@ -178,6 +179,7 @@ def process(
         assert model is not None
         check_lenses(names, model)
         files = [photo for each in photos for photo in each]
+        warn_of_false_joins(json.loads(read_text(motion / TORN)), {photo.name: photo.source for photo in files})
         tests = {photo.name for each in photos[train:] for photo in each}
         used = [Path(each.mask) for each in passes if each.mask]
         write_dataset(dataset, files, tests, model, used, sources[0] if sources[0].faces else None)

@@ -24,6 +24,8 @@ MODEL = "model"
 """Folder of the chosen model, in COLMAP's binary files; missing where none was found."""
 KEPT = "kept.json"
 """File with the names of the photos whose known poses were kept."""
+TORN = "torn.json"
+"""File with the pairs of names of photos that the model puts apart although their matches are among the strongest."""
 JOB = "job.json"
 """File with the child's arguments."""
 
@@ -51,7 +53,7 @@ class Pass:
     mask: str | None = None
     """File of a mask, black where no feature may lie; None: features may lie everywhere."""
     lens: list[float] | None = None
-    """fx, fy, cx, cy, k1, k2, p1, p2 to start from; None: as COLMAP guesses from the photos."""
+    """fx, fy, cx, cy, k1, k2, p1, p2 to start from; None: as COLMAP guesses from the photos, with square pixels."""
     mount: Mount | None = None
     """Of a camera on a rig, whose `lens` stays as it is; None: each photo's pose is its own."""
 

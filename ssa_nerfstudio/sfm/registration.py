@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import TYPE_CHECKING, Literal
@@ -124,6 +124,20 @@ def check_lenses(names: Sequence[str], model: pycolmap.Reconstruction) -> None:
                 f"pixels of {aspect(camera):.1f}:1 (focal lengths {fx:.0f} and {fy:.0f}): their poses are likely "
                 "wrong; mask what covers part of every frame, or take photos from more directions"
             )
+
+
+def warn_of_false_joins(torn: Sequence[Sequence[str]], sources: Mapping[str, str]) -> None:
+    """Warn of photos that are at the wrong place from there on.
+
+    Args:
+        torn: names of pairs of photos that the model puts apart although they match.
+        sources: for each photo the file that it was made from.
+    """
+    for one, other in torn:
+        _LOG.warning(
+            f"{sources[one]} and {sources[other]} show the same, and their poses contradict that: places that look "
+            "alike are likely taken for one, and part of the poses is wrong; take more photos around there"
+        )
 
 
 def _photos_of(name: str, passes: Sequence[object], photos: str = "the photos") -> str:
