@@ -67,10 +67,13 @@ def rejoin(database: Path, images: Path, model: pycolmap.Reconstruction, folder:
     for link in tree:
         if link not in torn:
             parts.join(*_frames(link, model))
-    # Each part's pose in the world of the result; torn links and parts are a tree, too.
-    placed = {parts.of(_frames(torn[0], model)[0]): np.eye(4)}
+    # Each part's pose in the world of the result; torn links and parts are trees, too.
+    placed: dict[int, np.ndarray] = {}
     while torn:
-        link = next(link for link in torn if any(parts.of(frame) in placed for frame in _frames(link, model)))
+        link = next((link for link in torn if any(parts.of(frame) in placed for frame in _frames(link, model))), None)
+        if link is None:  # photos without a link to those before stay where they are
+            placed[parts.of(_frames(torn[0], model)[0])] = np.eye(4)
+            continue
         torn.remove(link)
         if parts.of(_frames(link, model)[0]) not in placed:
             link = _Link((link.photos[1], link.photos[0]), link.matches[:, ::-1])
@@ -82,7 +85,7 @@ def rejoin(database: Path, images: Path, model: pycolmap.Reconstruction, folder:
     result = pycolmap.Reconstruction(model)
     for frame in result.frames.values():
         if frame.has_pose():
-            part = pycolmap.Sim3d(placed[parts.of(frame.frame_id)][:3])
+            part = pycolmap.Sim3d(placed.get(parts.of(frame.frame_id), np.eye(4))[:3])
             frame.rig_from_world = part.transform_camera_world(frame.rig_from_world)
     folder.mkdir()
     pycolmap.triangulate_points(result, database, images, folder)

@@ -70,8 +70,8 @@ class Corridor:
                 model.add_point3D(at, track, np.zeros(3, np.uint8))
         return model
 
-    def write(self, path: Path) -> None:
-        """A database of the features and of all matches, the true and the false ones."""
+    def write(self, path: Path, alone: int = -1) -> None:
+        """A database of the features and of all matches, the true and the false ones, but for those of one photo."""
         model = self.model(wrong=False)
         with pycolmap.Database.open(path) as database:
             database.write_camera(self.camera, use_camera_id=True)
@@ -85,7 +85,7 @@ class Corridor:
             for one, other in combinations(range(VIEWS), 2):
                 looks = self.looks[self.seen[one]], self.looks[self.seen[other]]
                 _, here, there = np.intersect1d(*looks, return_indices=True)
-                if len(here) >= 15:
+                if len(here) >= 15 and alone not in (one, other):
                     geometry = pycolmap.TwoViewGeometry()
                     geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
                     geometry.inlier_matches = np.column_stack([here, there]).astype(np.uint32)
@@ -113,6 +113,18 @@ def test_photos_that_were_joined_wrongly_are_put_where_their_neighbors_see_the_s
     found = pycolmap.Reconstruction(tmp_path / "model")
     assert center_errors(centers(found), CENTERS).max() < 1e-3
     assert torn_links(tmp_path / "database.db", found) == []
+
+
+@pytest.mark.parametrize("alone", [0, HALF, VIEWS - 1])
+def test_a_photo_without_matches_stays_where_it_is(tmp_path, alone):
+    corridor = Corridor()
+    corridor.write(tmp_path / "database.db", alone)
+    wrong = corridor.model(wrong=True)
+    before = centers(wrong)[alone]
+    assert rejoin(tmp_path / "database.db", tmp_path, wrong, tmp_path / "model")
+    found = centers(pycolmap.Reconstruction(tmp_path / "model"))
+    np.testing.assert_allclose(found[alone], before, atol=1e-9)
+    assert center_errors(np.delete(found, alone, axis=0), np.delete(CENTERS, alone, axis=0)).max() < 1e-3
 
 
 def test_a_model_that_its_matches_agree_with_is_left_alone(tmp_path, corridor):
