@@ -70,7 +70,9 @@ class JointOptimizers(Optimizers):
         for name in groups:
             max_norm = self.config[name]["optimizer"].max_norm
             if max_norm is not None:
-                torch.nn.utils.clip_grad_norm_(self.parameters[name], max_norm)
+                # Not self.parameters, which keeps those from before the first refinement.
+                groups_of = self.optimizers[name].param_groups
+                torch.nn.utils.clip_grad_norm_([p for group in groups_of for p in group["params"]], max_norm)
         fused = [optimizer for optimizer in optimizers if isinstance(optimizer, FusedAdam)]
         take_steps(fused, verdict)
         for optimizer in optimizers:

@@ -63,6 +63,15 @@ def test_what_a_group_asks_of_its_gradients_is_done(guarded):
     assert (a < 0).all()
 
 
+def test_gradients_of_parameters_that_a_refinement_has_put_in_are_clipped():
+    optimizers, _ = joint(max_norm=0.5)
+    refined = torch.nn.Parameter(torch.zeros(5))
+    optimizers.optimizers["a"].param_groups[0]["params"] = [refined]
+    refined.grad = torch.full((5,), 10.0)
+    optimizers.step_groups(["a", "b"], LOSS, NO_SCALER)
+    assert refined.grad.norm() == pytest.approx(0.5, rel=1e-4)
+
+
 def test_a_scaler_of_gradients_is_asked():
     optimizers, (a, b) = joint()
     scaler = torch.amp.GradScaler("cpu", init_scale=4.0)
