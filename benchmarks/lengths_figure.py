@@ -17,10 +17,13 @@ from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
 from ssa_nerfstudio.plugin.methods import METHODS
+from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH
 
 STYLES = {"adc": "-o", "mcmc": "--s"}
-COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
-"""Okabe and Ito's, which most color-blind people tell apart."""
+BAR = "none", "3dgs", FULL_LENGTH
+"""Effect, method and steps of the run that a capture is compared with."""
+Curves = dict[tuple[str, str], dict[int, list[Result]]]
+"""Results of each capture and densification: all seeds of every number of steps."""
 PRESETS = ("ssa-splatfacto-fast", "ssa-splatfacto")
 
 
@@ -37,18 +40,21 @@ class Command:
         """Write the picture and print Markdown.
 
         Raises:
-            InputError: the folder has no finished run at several lengths, or no bar.
+            InputError: the folder has no finished run at several lengths, or no bar, or the picture cannot be written.
         """
+        if self.output.suffix not in (".png", ".svg"):
+            raise InputError(f"{self.output} is no name of a picture", "end it with .png or .svg")
         found = [result for result in read_all([self.results])[0] if result.status == "finished"]
-        bars = {result.run.scene: result.metrics["psnr"] for result in found if result.run.effect == "none"}
-        runs = [result for result in found if result.run.effect != "none" and _is_of_a_curve(result)]
+        bars = {result.run.scene: result.metrics["psnr"] for result in found if _is_bar(result)}
+        runs = [result for result in found if _is_of_a_curve(result)]
         missing = sorted({result.run.scene for result in runs} - bars.keys())
         if not runs or missing:
             what = f"no bar of {', '.join(missing)}" if missing else "no run of several lengths"
             raise InputError(f"{self.results} has {what}", "run ssa tradeoff lengths and ssa bench lengths first")
-        curves: dict[tuple[str, str], dict[int, Result]] = {}
+        curves: Curves = {}
         for result in sorted(runs, key=lambda each: each.run.steps):
-            curves.setdefault((result.run.scene, result.run.densification), {})[result.run.steps] = result
+            curve = curves.setdefault((result.run.scene, result.run.densification), {})
+            curve.setdefault(result.run.steps, []).append(result)
         _draw(curves, bars, self.output)
         lengths = sorted({result.run.steps for result in runs})
         print(
@@ -61,29 +67,42 @@ class Command:
             print(f"| `{scene}` | {densification.upper()} | {' | '.join(cells)} | {bars[scene]:.2f} |")
 
 
+def _is_bar(result: Result) -> bool:
+    run = result.run
+    return (run.effect, run.method, run.steps) == BAR and not run.variation
+
+
 def _is_of_a_curve(result: Result) -> bool:
-    return not result.run.variation.keys() - {"steps", "densification"} and result.run.clean_tests
+    run = result.run
+    varied = run.variation.keys() - {"steps", "densification"}
+    return run.method == "overlay-on" and run.effect != "none" and run.clean_tests and not varied
 
 
-def _cell(result: Result) -> str:
-    """PSNR, and the seconds of a run that had its device to itself."""
-    return f"{result.metrics['psnr']:.2f}" + (f" ({_seconds(result):.0f} s)" if result.alone else "")
+def _psnr(seeds: list[Result]) -> float:
+    return statistics.mean(result.metrics["psnr"] for result in seeds)
 
 
-def _seconds(result: Result) -> float:
-    return result.seconds["statistics"] + result.seconds["training"]
+def _seconds(seeds: list[Result]) -> float | None:
+    """Of statistics and training, where a run had its device to itself."""
+    alone = [result.seconds["statistics"] + result.seconds["training"] for result in seeds if result.alone]
+    return statistics.mean(alone) if alone else None
 
 
-def _draw(curves: dict[tuple[str, str], dict[int, Result]], bars: dict[str, float], path: Path) -> None:
+def _cell(seeds: list[Result]) -> str:
+    seconds = _seconds(seeds)
+    return f"{_psnr(seeds):.2f}" + ("" if seconds is None else f" ({seconds:.0f} s)")
+
+
+def _draw(curves: Curves, bars: dict[str, float], path: Path) -> None:
     import matplotlib
 
     matplotlib.use("agg")
     from matplotlib import pyplot
 
     figure, axes = pyplot.subplots(figsize=(8, 4.6), constrained_layout=True)
-    colors = dict(zip(sorted(bars), COLORS, strict=False))
+    colors = {scene: f"C{number}" for number, scene in enumerate(sorted(bars))}
     for (scene, densification), curve in sorted(curves.items()):
-        gains = [result.metrics["psnr"] - bars[scene] for result in curve.values()]
+        gains = [_psnr(seeds) - bars[scene] for seeds in curve.values()]
         label = f"{scene}, {densification.upper()}"
         axes.plot([*curve], gains, STYLES[densification], color=colors[scene], label=label, markersize=4)
     lengths = sorted({steps for curve in curves.values() for steps in curve})
@@ -98,7 +117,8 @@ def _draw(curves: dict[tuple[str, str], dict[int, Result]], bars: dict[str, floa
     axes.set_xlabel("training steps")
     axes.set_ylabel("PSNR of clean test views, dB\nagainst clean photos and 30,000 steps")
     axes.legend(fontsize=7, frameon=False, loc="lower right", handlelength=3)
-    alone = [_seconds(result) / steps for curve in curves.values() for steps, result in curve.items() if result.alone]
+    times = [(_seconds(seeds), steps) for curve in curves.values() for steps, seeds in curve.items()]
+    alone = [seconds / steps for seconds, steps in times if seconds is not None]
     if alone:
         pace = statistics.median(alone)
         above = axes.secondary_xaxis("top", functions=(lambda steps: steps * pace, lambda seconds: seconds / pace))

@@ -20,7 +20,7 @@ class Command:
     output: Path
     """The JSON file to write; the trained model goes into a folder beside it."""
     method: str = "ssa-splatfacto"
-    """ssa-splatfacto, ssa-splatfacto-mcmc or ssa-splatfacto-paper."""
+    """ssa-splatfacto, or with -fast, -mcmc or -paper behind it."""
     steps: int = 30_000
     """Training steps; every schedule is scaled to them."""
     settings: tuple[str, ...] = ()

@@ -101,7 +101,7 @@ class RecordedFunction:
         Args:
             function: of the inputs and the parameters.
             inputs: with the shapes, types and needs of a gradient of all later calls.
-            parameters: they, or others in their place, must stay where they are.
+            parameters: their memory must not move; the objects may be replaced.
             record: `CapturedPrograms`, or what repeats programs on a CPU in a test.
         """
         self.calls = 0
@@ -235,7 +235,7 @@ class RecordedCalls:
         return recorded(*inputs, *parameters)
 
     def forget(self) -> None:
-        """Drop all recordings, and with them their memory and the parameters that they were made of."""
+        """Drop all recordings, and with them their memory and that of the parameters that they were made of."""
         self._known, self._record, self._epoch = {}, None, None
 
 

@@ -54,8 +54,8 @@ class Command:
     )
     """What to train; -fast: ssa-splatfacto in fewer steps."""
     steps: int | None = None
-    """Training steps; schedules are scaled to them. Default: the method's own with a GPU (15000; -fast 4000,
-    -paper 30000), 2000 without."""
+    """Training steps; schedules are scaled to them. Default: 15000 with a GPU (4000 for -fast, 30000 for -paper),
+    2000 without."""
     forwarded: tyro.conf.Suppress[tuple[tuple[str, ...], ...]] = ((),) * len(STAGES)
     """What followed --detect., --process. and --train., as options of those commands."""
 

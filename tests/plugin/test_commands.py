@@ -23,7 +23,7 @@ from nerfstudio.configs.method_configs import all_methods
 from PIL import Image
 from plyfile import PlyData
 
-import ssa_nerfstudio.plugin.methods  # noqa: F401 - lets torch.load read the checkpoints, as in every command
+from ssa_nerfstudio.plugin.methods import METHODS  # also lets torch.load read the checkpoints, as in every command
 
 BIN = Path(sys.executable).parent
 TRAIN = ("--vis", "tensorboard", "--pipeline.model.num-downscales", "0", "--pipeline.model.stop-split-at", "1")
@@ -230,6 +230,14 @@ def test_the_viewer_serves_a_trained_model(config):
     finally:
         viewer.kill()
         viewer.wait()
+
+
+def test_the_readme_states_how_long_the_methods_train():
+    steps = {name: METHODS[name].max_num_iterations for name in METHODS}
+    readme = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
+    assert f"in {steps['ssa-splatfacto-fast']} steps instead of {steps['ssa-splatfacto']:,}" in readme
+    assert steps["ssa-splatfacto-mcmc"] == steps["ssa-splatfacto"]
+    assert steps["ssa-splatfacto-paper"] == 30_000
 
 
 def test_nerfstudio_finds_the_methods():

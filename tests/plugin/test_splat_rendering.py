@@ -151,11 +151,12 @@ def test_recordings_of_fewer_gaussians_are_given_up_once_there_are_too_many_to_r
     former = torch.nn.Parameter(torch.ones(3))
     for _ in range(2):
         renderer.projections(double, [], [former], "kind")
-    kept = weakref.ref(double)  # as long as its recording
-    del double
+    kept, parameter = weakref.ref(double), weakref.ref(former)
+    del double, former
     outcome(renderer, parameters(50, "cpu"), 0, 3, "classic")
     gc.collect()
-    assert kept() is not None
+    assert kept() is not None  # as long as its recording
+    assert parameter() is None
     outcome(renderer, parameters(51, "cpu"), 0, 3, "classic")
     gc.collect()
     assert kept() is None

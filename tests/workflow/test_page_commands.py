@@ -9,8 +9,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
+from rich.console import Console
 
-from ssa_nerfstudio.cli import arguments
+from ssa_nerfstudio.cli import arguments, run
+from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.workflow.choices import Choices
 from ssa_nerfstudio.workflow.finished_training import Evaluation, PicturedGroup
 from ssa_nerfstudio.workflow.photos_to_splats import DATASET
@@ -54,6 +57,14 @@ def test_a_run_without_an_overlay_offers_nothing_that_needs_one(tiny_scene, tmp_
     (capture,) = (command for command in alone.values() if "export-dataset" in command)
     assert "--load-config" not in capture
     assert str(os.path.relpath(tiny_scene, tmp_path)) in capture
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_with_a_gpu_a_method_has_its_own_number_of_steps(method, tiny_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    for asked, expected in ((None, METHODS[method].max_num_iterations), (7, 7)):
+        choices, plan = run.Command(tiny_scene, tmp_path / "out", method, asked)._plan(Console(quiet=True))
+        assert choices.steps == plan.training.max_num_iterations == expected
 
 
 @pytest.mark.parametrize(("steps", "saved_every"), [(10, 1), (2_000, 100), (30_000, 1_500), (200_000, 2_000)])

@@ -12,9 +12,9 @@ Config = TypeVar("Config", bound=TrainerConfig)
 FULL_LENGTH = 30_000
 """Steps that every schedule of splatfacto and 3DGS assumes."""
 DEFAULT_LENGTH = 15_000
-"""Steps of a training with a GPU. More gain nothing on the mean of four captures (docs/cost.md)."""
+"""Steps of a training with a GPU: between 7000, which small captures need, and splatfacto's 30,000 (docs/cost.md)."""
 FAST_LENGTH = 4_000
-"""The knee of quality over time: from here on a doubling of the time gains less than half a decibel (docs/cost.md)."""
+"""The shortest length that was within half a decibel of 7000 steps on every capture (docs/cost.md)."""
 MIN_REFINE_EVERY = 10
 """Lower bound of the steps between two refinements, whose statistics need a few views."""
 MIN_STEPS_PER_IMAGE = 100
