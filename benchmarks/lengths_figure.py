@@ -84,7 +84,7 @@ def _psnr(seeds: list[Result]) -> float:
 
 def _seconds(seeds: list[Result]) -> float | None:
     """Of statistics and training, where a run had its device to itself."""
-    alone = [result.seconds["statistics"] + result.seconds["training"] for result in seeds if result.alone]
+    alone = [result.learning_seconds for result in seeds if result.alone]
     return statistics.mean(alone) if alone else None
 
 

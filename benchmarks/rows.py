@@ -94,7 +94,7 @@ def costs(study: Study, methods: Sequence[str], columns: Sequence[tuple[str, str
         finished = ([r for r in row[column] if r.status == "finished"] for row in whole)
         return statistics.mean(statistics.mean(map(figure, chosen)) for chosen in finished)
 
-    seconds = [mean_of(lambda r: r.seconds["statistics"] + r.seconds["training"], k) for k in range(len(columns))]
+    seconds = [mean_of(lambda r: r.learning_seconds, k) for k in range(len(columns))]
     heads = ("FLIP", "color deviation", "peak MB", f"seconds, {methods[0]} = 1")
     lines = [f"| mean of {len(whole)} | {' | '.join(heads)} |", f"|{'---|' * (1 + len(heads))}"]
     for k, method in enumerate(methods):

@@ -73,6 +73,11 @@ class Result:
         """From when the run was asked for to its end."""
         return sum(self.seconds.values())
 
+    @property
+    def learning_seconds(self) -> float:
+        """Of the photos' statistics and the training, which settings decide; of a finished run."""
+        return self.seconds["statistics"] + self.seconds["training"]
+
 
 def write(result: Result, path: Path) -> None:
     """Writes a result; the file appears when it is complete."""
