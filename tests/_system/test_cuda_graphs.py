@@ -10,7 +10,13 @@ from recordings import CUDA, recorder, run_again
 from torch import Tensor
 
 from ssa_nerfstudio._system import cuda_graphs
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, RecordedChanges, RecordedFunction
+from ssa_nerfstudio._system.cuda_graphs import (
+    CapturedPrograms,
+    RecordedCalls,
+    RecordedChanges,
+    RecordedFunction,
+    side_by_side,
+)
 
 
 class Mixture:
@@ -207,3 +213,21 @@ def test_changes_are_recorded_after_all_earlier_recordings_were_given_up(device,
     assert total.item() == len("aaabbbcdefggghhhaaa")
     assert changes._known["a"] is not None
     assert "cannot be used" not in caplog.text
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_programs_side_by_side_come_after_what_was_before_and_before_what_is_after(device):
+    length = 1 << 22  # long enough that a branch which waits for nothing is too early
+    source, parts, total = (torch.zeros(*shape, device=device) for shape in ((length,), (3, length), (length,)))
+
+    def program() -> list[Tensor]:
+        source.add_(1).sqrt_().square_()
+        side_by_side([lambda part=part: part.copy_(source).mul_(2) for part in parts])
+        torch.sum(parts, dim=0, out=total)
+        return [total]
+
+    (found,), repeat = recorder(device)()(program)
+    for _ in range(3):
+        repeat()
+        torch.testing.assert_close(found, 6 * source)
+    assert source[0] > 3

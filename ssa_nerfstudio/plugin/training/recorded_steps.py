@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import RecordedChanges
+from ssa_nerfstudio._system.cuda_graphs import RecordedChanges, side_by_side
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam, count_steps
 from ssa_nerfstudio.plugin.training.nonfinite import NonFiniteGuard, Verdict
 
@@ -25,8 +26,10 @@ def take_steps(
     """
     counters = [counter for optimizer in optimizers for counter in optimizer.counters()]
     count_steps(counters, 1 if verdict is None else verdict.taken)
-    for optimizer, rate in zip(optimizers, rates or [None] * len(optimizers), strict=True):
-        optimizer.update(None if verdict is None else verdict.skipped, rate=rate)
+    skipped = None if verdict is None else verdict.skipped
+    per_optimizer = zip(optimizers, rates or [None] * len(optimizers), strict=True)
+    # A launch of torch's takes as long for a few thousand numbers as for a million: 65,536 of them are one block's.
+    side_by_side([partial(optimizer.update, skipped, rate=rate) for optimizer, rate in per_optimizer])
 
 
 class RecordedSteps:
