@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from ssa_nerfstudio._system.cuda_graphs import repeat
 from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
@@ -223,19 +224,20 @@ def _solve(sums: Tensor, across: Tensor, down: Tensor, prior: Tensor, expected: 
         t = (x[:1] - (ratio * x[1:]).sum(dim=0, keepdim=True)) * remainder
         return torch.cat([t, (x[1:] * inverse).addcmul_(ratio, t, value=-1)])
 
+    layers = layers.clone()
     residual = torch.cat([products, observed]) + prior * expected - system(layers)
-    conditioned = condition(residual)
-    direction, energy = conditioned, _dot(residual, conditioned)
-    for _ in range(CONJUGATE_GRADIENT_STEPS):
+    direction = condition(residual)
+    energy = (residual * direction).sum()
+
+    def descend() -> None:
         image = system(direction)
-        step = energy / _dot(direction, image).clamp_min(1e-20)
-        layers = torch.addcmul(layers, step, direction)
-        residual = torch.addcmul(residual, step, image, value=-1)
+        step = energy / (direction * image).sum().clamp_min(1e-20)
+        layers.addcmul_(step, direction)
+        residual.addcmul_(step, image, value=-1)
         conditioned = condition(residual)
-        previous, energy = energy, _dot(residual, conditioned)
-        direction = torch.addcmul(conditioned, energy / previous.clamp_min(1e-20), direction)
+        left = (residual * conditioned).sum()
+        direction.mul_(left / energy.clamp_min(1e-20)).add_(conditioned)
+        energy.copy_(left)
+
+    repeat(descend, CONJUGATE_GRADIENT_STEPS, layers.device)
     return layers.movedim(0, -1).float()
-
-
-def _dot(a: Tensor, b: Tensor) -> Tensor:
-    return torch.dot(a.flatten(), b.flatten())

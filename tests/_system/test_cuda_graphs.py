@@ -15,6 +15,7 @@ from ssa_nerfstudio._system.cuda_graphs import (
     RecordedCalls,
     RecordedChanges,
     RecordedFunction,
+    repeat,
     side_by_side,
 )
 
@@ -231,3 +232,24 @@ def test_programs_side_by_side_come_after_what_was_before_and_before_what_is_aft
         repeat()
         torch.testing.assert_close(found, 6 * source)
     assert source[0] > 3
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("times", [1, 2, 50])
+def test_a_repeated_program_runs_as_often_as_asked(device, times):
+    values = torch.ones(3, dtype=torch.float64, device=device)
+    repeat(lambda: values.mul_(2).sub_(values.mean() / 4), times, values.device)
+    assert values.tolist() == [pytest.approx(1.5**times)] * 3
+
+
+def test_what_cannot_be_captured_is_repeated_plainly(monkeypatch, caplog):
+    class NoCapture:
+        def capture(self, program):
+            raise RuntimeError("operation not permitted when stream is capturing")
+
+    monkeypatch.setattr(cuda_graphs, "graphs_are_usable", lambda: True)
+    monkeypatch.setattr(cuda_graphs, "CapturedPrograms", NoCapture)
+    total = torch.zeros(())
+    repeat(lambda: add(total), 5, torch.device("cuda"))
+    assert total.item() == 5
+    assert "CUDA graphs cannot be used" in caplog.text
