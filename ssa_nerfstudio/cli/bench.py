@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-import os
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError, TrainingError
@@ -49,7 +49,7 @@ class Command:
     """Keep config.yml and checkpoint of every training in models/, for ns-viewer and ns-export."""
     list: bool = False
     """Print the ids of the runs, and which are done, and stop."""
-    threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads: int = field(default_factory=usable_cores)
     """Photos worked on at once while datasets are made."""
 
     def run(self) -> None:

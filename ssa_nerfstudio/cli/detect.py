@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import os
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.cli.arguments import STANDARD_OUTPUT
 from ssa_nerfstudio.errors import InputError
@@ -31,7 +31,7 @@ class Command:
     """Number of captures of randomly shifted views to compare with, from 200 to 100000."""
     frames: int = 200
     """Number of frames to take from videos."""
-    threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads: int = field(default_factory=usable_cores)
     """Number of photos decoded at once."""
 
     def check(self) -> None:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import shlex
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.errors import InputError
@@ -35,7 +35,7 @@ class Command:
     """One photo in so many, in sorted order, is for testing; ignored where transforms.json has a split."""
     downscale_factor: int = 1
     """Read the photos from images_N and write a dataset of that size."""
-    threads: int = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    threads: int = field(default_factory=usable_cores)
     """Photos in flight at once."""
 
     def run(self) -> None:
