@@ -29,6 +29,7 @@ from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConf
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
 from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
+from ssa_nerfstudio.plugin.kernel_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
@@ -84,6 +85,8 @@ class SSAPipeline(VanillaPipeline):
             check_split_options(transforms, parser.eval_mode, parser.train_split_fraction, parser.eval_interval)
             if test_mode == "val" and parser.load_3D_points:
                 check_seed_points(transforms)
+        if test_mode == "val" and torch.device(device).type == "cuda":
+            load_triton_meanwhile()
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
         self.sphere: SharedSphere | None = None
         check_views(self.datamanager.train_dataparser_outputs, source)
