@@ -11,6 +11,7 @@ from torch import Tensor
 from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable
 from ssa_nerfstudio._system.parameter_replacement import parameters_replaced
 from ssa_nerfstudio.overlay.photometric import photometric_loss
+from ssa_nerfstudio.overlay.resampling import box_reduce
 from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
@@ -35,6 +36,10 @@ class PhotoLosses(SplatfactoModel):
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Convert a photo to [0, 1] with upstream's result to the last bit, in one pass over uint8 instead of two."""
         return super().get_gt_img(torch.div(image, 255.0) if image.dtype == torch.uint8 else image)
+
+    def _downscale_if_required(self, image: Tensor) -> Tensor:
+        """An image [H, W, C], averaged over blocks as upstream's: in full precision, and without loading cuDNN."""
+        return box_reduce(image, self._get_downscale_factor())
 
     def target(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         """The photo [H, W, 3] in [0, 1], composited over the render's background where it is transparent."""

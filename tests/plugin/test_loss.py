@@ -6,6 +6,7 @@ import copy
 
 import pytest
 import torch
+from nerfstudio.models.splatfacto import resize_image
 
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.photometric import photometric_loss
@@ -50,6 +51,14 @@ def losses(model, **batch) -> dict[str, torch.Tensor]:
 def assert_close(found: torch.Tensor, expected: torch.Tensor) -> None:
     """Equal to float32's rounding, on whichever devices they are."""
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-7, check_device=False)
+
+
+@pytest.mark.parametrize(("downscales", "reduction"), [(0, 1), (1, 2), (2, 4)])
+def test_a_photo_is_reduced_as_upstream_reduces_it(model, downscales, reduction):
+    model.config.num_downscales = downscales
+    photo = (255 * PHOTO).to(torch.uint8)
+    expected = resize_image(photo.float() / 255, reduction) if reduction > 1 else photo.float() / 255
+    assert_close(model.get_gt_img(photo).cpu(), expected)
 
 
 def test_what_a_mask_excludes_is_no_part_of_the_loss(model):
