@@ -220,6 +220,9 @@ def _learned_overlay(
 def views_of(photos: list[dict[str, Any]], cameras: Cameras, gains: torch.Tensor | None = None) -> list[View]:
     """Join photos of the datamanager's cache with their cameras, and with their gains [V, 3]."""
     poses, lenses = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
+    if photos:
+        device = photos[0]["image"].device  # where the points are projected; at once instead of view by view
+        poses, lenses = poses.to(device), lenses.to(device)
     return [
         View(photo["image"], photo.get("mask"), poses[i], lenses[i], None if gains is None else gains[i])
         for i, photo in enumerate(photos)

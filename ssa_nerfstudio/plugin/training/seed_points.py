@@ -29,6 +29,7 @@ def nearest_depth(points: Tensor, view_matrices: Tensor, Ks: Tensor, width: int,
         width, height: of the largest frame, pixels.
     """
     points = regular_subset(points, len(view_matrices))
+    view_matrices, Ks = view_matrices.to(points), Ks.to(points)  # at once instead of view by view
     seen = [project(points, pose, K, height, width)[2] for pose, K in zip(view_matrices, Ks, strict=True)]
     depths = torch.cat(seen)
     depths = depths[depths > NEAR_PLANE]
@@ -42,7 +43,9 @@ def outside_cameras(means: Tensor, positions: Tensor) -> Tensor:
     """
     inside = torch.zeros(len(means), dtype=torch.bool, device=means.device)
     for chunk in positions.to(means).split(64):
-        inside |= (torch.cdist(means, chunk) < MIN_DISTANCE).any(dim=1)
+        # By differences: by products it would be less exact, and load cuBLAS.
+        distances = torch.cdist(means, chunk, compute_mode="donot_use_mm_for_euclid_dist")
+        inside |= (distances < MIN_DISTANCE).any(dim=1)
     if inside.all():
         _LOG.warning(
             f"every seed point is within {MIN_DISTANCE} of a camera, nearer than any is drawn: the scene is too small; "
