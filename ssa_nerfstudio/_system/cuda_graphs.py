@@ -86,7 +86,7 @@ def _capture_stream(device: int) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)
 
 
-def repeat(program: Callable[[], None], times: int, device: torch.device) -> None:
+def repeat(program: Callable[[], object], times: int, device: torch.device) -> None:
     """Run a program that changes tensors in place a number of times, on CUDA as a graph from the second time on.
 
     Args:
@@ -94,11 +94,16 @@ def repeat(program: Callable[[], None], times: int, device: torch.device) -> Non
         times: at least 1.
         device: of the program's tensors.
     """
+
+    def once() -> list[Tensor]:
+        program()
+        return []
+
     program()
     again: Callable[[], object] = program
     if times > 2 and device.type == "cuda" and graphs_are_usable():
         try:
-            _, again = CapturedPrograms().capture(lambda: program() or [])
+            _, again = CapturedPrograms().capture(once)
         except RuntimeError as error:
             _warn(error)
     for _ in range(times - 1):
