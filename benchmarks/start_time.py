@@ -51,7 +51,7 @@ class Command:
     """Starts of each; the first is not counted."""
 
     def run(self) -> None:
-        """Print a line for each method: seconds of each round, their median, and its ratio to the first method's.
+        """Print each start, and at the end a line for each method: its seconds, their median, and its ratio to the first.
 
         Raises:
             InputError: an option is out of range, the dataset cannot be trained on, or a start failed.
@@ -65,6 +65,7 @@ class Command:
         for _ in range(self.rounds):
             for method in self.methods:
                 seconds[method].append(_start(method, self.data))
+                print(f"{method}: {seconds[method][-1]:.1f} s", flush=True)
         medians = {method: statistics.median(found[1:] or found) for method, found in seconds.items()}
         for method, found in seconds.items():
             each = ", ".join(f"{value:.1f}" for value in found)
