@@ -28,11 +28,12 @@ _LOG = logging.getLogger(__name__)
 
 def graphs_are_usable() -> bool:
     """Whether there is CUDA, and SSA_CUDA_GRAPHS is not 0."""
-    return os.environ.get("SSA_CUDA_GRAPHS") != "0" and _has_cuda()
+    return os.environ.get("SSA_CUDA_GRAPHS") != "0" and has_cuda()
 
 
 @cache
-def _has_cuda() -> bool:
+def has_cuda() -> bool:
+    """Whether this process can use CUDA, asked of the driver once."""
     return torch.cuda.is_available()
 
 
@@ -84,56 +85,6 @@ class CapturedPrograms:
 def _capture_stream(device: int) -> torch.cuda.Stream:
     """One for all captures: libraries hold memory for each stream on which they are used, cuBLAS 32 MiB."""
     return torch.cuda.Stream(device)
-
-
-def repeat(program: Callable[[], object], times: int, device: torch.device) -> None:
-    """Run a program that changes tensors in place a number of times, on CUDA as a graph from the second time on.
-
-    Args:
-        program: as a `Function`, but for what it returns.
-        times: at least 1.
-        device: of the program's tensors.
-    """
-
-    def once() -> list[Tensor]:
-        program()
-        return []
-
-    program()
-    again: Callable[[], object] = program
-    if times > 2 and device.type == "cuda" and graphs_are_usable():
-        try:
-            _, again = CapturedPrograms().capture(once)
-        except RuntimeError as error:
-            _warn(error)
-    for _ in range(times - 1):
-        again()
-    if again is not program:
-        torch.cuda.current_stream().synchronize()  # the graph must not be destroyed while it runs
-
-
-def side_by_side(programs: Sequence[Callable[[], object]]) -> None:
-    """Run programs that do not depend on each other: as branches of a graph in a capture, elsewhere in turn.
-
-    Of kernels that leave most of the device idle, a graph runs several at a time.
-    """
-    if not (_has_cuda() and torch.cuda.is_current_stream_capturing()):
-        for program in programs:
-            program()
-        return
-    trunk = torch.cuda.current_stream()
-    branches = _branch_streams(trunk.device_index, len(programs))
-    for branch, program in zip(branches, programs, strict=True):
-        branch.wait_stream(trunk)
-        with torch.cuda.stream(branch):
-            program()
-    for branch in branches:
-        trunk.wait_stream(branch)
-
-
-@cache
-def _branch_streams(device: int, count: int) -> list[torch.cuda.Stream]:
-    return [torch.cuda.Stream(device) for _ in range(count)]
 
 
 class RecordedFunction:
@@ -280,7 +231,7 @@ class RecordedCalls:
                 recorded = self._known[kind] = RecordedFunction(function, inputs, parameters, self._record)
             except RuntimeError as error:
                 self._failed, self._known = True, {}
-                _warn(error)
+                warn_of_plain_launches(error)
                 return function(*inputs, *parameters)
         return recorded(*inputs, *parameters)
 
@@ -289,42 +240,8 @@ class RecordedCalls:
         self._known, self._record, self._epoch = {}, None, None
 
 
-class RecordedChanges:
-    """Runs programs that change tensors in place: plainly at first, from the second time on as CUDA graphs."""
-
-    def __init__(self, limit: int = 8) -> None:
-        """Record nothing yet; at most `limit` programs are remembered."""
-        self._limit = limit
-        self._record: CapturedPrograms | None = None
-        self._known: dict[Hashable, Callable[[], object] | None] = {}
-        self._failed = False
-
-    def __call__(self, program: Callable[[], None], key: Hashable) -> None:
-        """Run a program once.
-
-        Args:
-            program: it launches the same kernels whenever the key is the same.
-            key: the addresses and sizes of all tensors that it reads or changes, and what else it depends on.
-        """
-        repeat = self._known.get(key)
-        if repeat is None and key in self._known and not self._failed:
-            try:
-                self._record = self._record or CapturedPrograms()
-                _, repeat = self._record.capture(lambda: program() or [])
-                self._known[key] = repeat
-            except RuntimeError as error:
-                self._failed = True
-                _warn(error)
-        elif repeat is None:
-            self._known[key] = None
-            if len(self._known) > self._limit:
-                del self._known[next(iter(self._known))]
-                if not any(self._known.values()):
-                    self._record = None  # nothing can be captured into a pool whose last graph is gone
-        (repeat or program)()
-
-
-def _warn(error: RuntimeError) -> None:
+def warn_of_plain_launches(error: RuntimeError) -> None:
+    """Say that nothing can be captured, and why."""
     _LOG.warning(f"CUDA graphs cannot be used, steps take longer: {str(error).splitlines()[0]}")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio._system.cuda_graphs import repeat
+from ssa_nerfstudio._system.in_place_graphs import repeat
 from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean

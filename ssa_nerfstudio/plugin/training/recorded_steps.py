@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import RecordedChanges, side_by_side
+from ssa_nerfstudio._system.in_place_graphs import RecordedChanges, side_by_side
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam, count_steps
 from ssa_nerfstudio.plugin.training.nonfinite import NonFiniteGuard, Verdict
 

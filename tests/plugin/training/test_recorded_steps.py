@@ -8,7 +8,7 @@ import pytest
 import torch
 from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
-from ssa_nerfstudio._system.cuda_graphs import RecordedChanges
+from ssa_nerfstudio._system.in_place_graphs import RecordedChanges
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
 from ssa_nerfstudio.plugin.training.nonfinite import NonFiniteGuard
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers

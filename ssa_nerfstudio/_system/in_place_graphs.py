@@ -1,0 +1,101 @@
+"""Programs that change tensors in place, as CUDA graphs: repeated, recorded by what they change, or side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import cache
+
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio._system.cuda_graphs import (
+    CapturedPrograms,
+    graphs_are_usable,
+    has_cuda,
+    warn_of_plain_launches,
+)
+
+
+def repeat(program: Callable[[], object], times: int, device: torch.device) -> None:
+    """Run a program that changes tensors in place a number of times, on CUDA as a graph from the second time on.
+
+    Args:
+        program: draws no random numbers, reads nothing from the device and launches the same kernels every time.
+        times: at least 1.
+        device: of the program's tensors.
+    """
+
+    def once() -> list[Tensor]:
+        program()
+        return []
+
+    program()
+    again: Callable[[], object] = program
+    if times > 2 and device.type == "cuda" and graphs_are_usable():
+        try:
+            _, again = CapturedPrograms().capture(once)
+        except RuntimeError as error:
+            warn_of_plain_launches(error)
+    for _ in range(times - 1):
+        again()
+    if again is not program:
+        torch.cuda.current_stream().synchronize()  # the graph must not be destroyed while it runs
+
+
+def side_by_side(programs: Sequence[Callable[[], object]]) -> None:
+    """Run programs that do not depend on each other: as branches of a graph in a capture, elsewhere in turn.
+
+    Of kernels that leave most of the device idle, a graph runs several at a time.
+    """
+    if not (has_cuda() and torch.cuda.is_current_stream_capturing()):
+        for program in programs:
+            program()
+        return
+    trunk = torch.cuda.current_stream()
+    branches = _branch_streams(trunk.device_index, len(programs))
+    for branch, program in zip(branches, programs, strict=True):
+        branch.wait_stream(trunk)
+        with torch.cuda.stream(branch):
+            program()
+    for branch in branches:
+        trunk.wait_stream(branch)
+
+
+@cache
+def _branch_streams(device: int, count: int) -> list[torch.cuda.Stream]:
+    return [torch.cuda.Stream(device) for _ in range(count)]
+
+
+class RecordedChanges:
+    """Runs programs that change tensors in place: plainly at first, from the second time on as CUDA graphs."""
+
+    def __init__(self, limit: int = 8) -> None:
+        """Record nothing yet; at most `limit` programs are remembered."""
+        self._limit = limit
+        self._record: CapturedPrograms | None = None
+        self._known: dict[Hashable, Callable[[], object] | None] = {}
+        self._failed = False
+
+    def __call__(self, program: Callable[[], None], key: Hashable) -> None:
+        """Run a program once.
+
+        Args:
+            program: it launches the same kernels whenever the key is the same.
+            key: the addresses and sizes of all tensors that it reads or changes, and what else it depends on.
+        """
+        repeat = self._known.get(key)
+        if repeat is None and key in self._known and not self._failed:
+            try:
+                self._record = self._record or CapturedPrograms()
+                _, repeat = self._record.capture(lambda: program() or [])
+                self._known[key] = repeat
+            except RuntimeError as error:
+                self._failed = True
+                warn_of_plain_launches(error)
+        elif repeat is None:
+            self._known[key] = None
+            if len(self._known) > self._limit:
+                del self._known[next(iter(self._known))]
+                if not any(self._known.values()):
+                    self._record = None  # nothing can be captured into a pool whose last graph is gone
+        (repeat or program)()
