@@ -51,7 +51,7 @@ class Command:
     """Starts of each; the first is not counted."""
 
     def run(self) -> None:
-        """Print each start, and at the end a line for each method: its seconds, their median, and its ratio to the first.
+        """Print each start, then a line for each method: its seconds, their median, and its ratio to the first.
 
         Raises:
             InputError: an option is out of range, the dataset cannot be trained on, or a start failed.
