@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import random
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from mutation.changed_folder import KNOWN, NOTICED, ChangedFolder
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 
@@ -26,7 +26,7 @@ class Command:
     """Folder below ssa_nerfstudio, and below tests: overlay, evidence, plugin/training, ...; or all of them: all."""
     output: Path = Path("build/mutants")
     """Folder to work in. A stopped run continues; survivors and mutants of changed functions are tried anew."""
-    children: int = len(os.sched_getaffinity(0))
+    children: int = field(default_factory=usable_cores)
     """Mutants tried at once."""
     sample: int = 0
     """Try so many, drawn at random from all changes that are asked for; 0: all."""

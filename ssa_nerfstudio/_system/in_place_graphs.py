@@ -17,12 +17,12 @@ from ssa_nerfstudio._system.cuda_graphs import (
 
 
 def repeat(program: Callable[[], object], times: int, device: torch.device) -> None:
-    """Run a program that changes tensors in place a number of times, on CUDA as a graph from the second time on.
+    """Run a program that changes tensors in place a number of times, more than two on CUDA as a graph.
 
     Args:
-        program: draws no random numbers, reads nothing from the device and launches the same kernels every time.
+        program: it draws no random numbers, reads nothing from the device and launches the same kernels every time.
         times: at least 1.
-        device: of the program's tensors.
+        device: of the program's tensors, as they state it.
     """
 
     def once() -> list[Tensor]:
@@ -31,7 +31,8 @@ def repeat(program: Callable[[], object], times: int, device: torch.device) -> N
 
     program()
     again: Callable[[], object] = program
-    if times > 2 and device.type == "cuda" and graphs_are_usable():
+    # A graph is captured from a stream of the current device: on another one, nothing would be in it.
+    if times > 2 and device.type == "cuda" and graphs_are_usable() and device.index == torch.cuda.current_device():
         try:
             _, again = CapturedPrograms().capture(once)
         except RuntimeError as error:

@@ -32,6 +32,9 @@ from ssa_nerfstudio.plugin.view_geometry import metadata, prepare
 TRAINING_REDUCTIONS = (1, 2, 4, 8)
 """Factors by which splatfacto's resolution schedule reduces photos, for which intrinsics are kept ready."""
 
+MAX_DECODING_THREADS = 16
+"""Each holds a photo and its undistortion, a tenth of a gigabyte for 12 megapixels."""
+
 
 class PhotoDataset(InputDataset):
     """nerfstudio's dataset, with our decoder: pixels that it would misread are refused, and errors name the file.
@@ -166,10 +169,10 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
 
 @contextmanager
 def _a_thread_per_core() -> Iterator[None]:
-    """Let upstream decode and undistort photos in as many threads as there are cores, instead of two."""
+    """Let upstream decode and undistort photos in a thread per core, instead of two; for one caller at a time."""
     upstream: Any = full_images_datamanager
-    former = upstream.ThreadPoolExecutor
-    upstream.ThreadPoolExecutor = lambda max_workers: former(max(max_workers, usable_cores()))
+    former, threads = upstream.ThreadPoolExecutor, min(MAX_DECODING_THREADS, usable_cores())
+    upstream.ThreadPoolExecutor = lambda max_workers: former(max(max_workers, threads))
     try:
         yield
     finally:

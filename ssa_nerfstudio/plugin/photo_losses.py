@@ -34,12 +34,16 @@ class PhotoLosses(SplatfactoModel):
         self._recorded = RecordedCalls(CapturedPrograms)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
-        """Convert a photo to [0, 1] with upstream's result to the last bit, in one pass over uint8 instead of two."""
+        """Convert a photo to [0, 1], in one pass over uint8 instead of two.
+
+        Upstream's result, to the last bit where it is not reduced.
+        """
         return super().get_gt_img(torch.div(image, 255.0) if image.dtype == torch.uint8 else image)
 
     def _downscale_if_required(self, image: Tensor) -> Tensor:
         """An image [H, W, C], averaged over blocks as upstream's: in full precision, and without loading cuDNN."""
-        return box_reduce(image, self._get_downscale_factor())
+        reduction = self._get_downscale_factor()
+        return image if reduction == 1 else box_reduce(image.float(), reduction)
 
     def target(self, outputs: dict[str, Tensor], batch: dict[str, Tensor]) -> Tensor:
         """The photo [H, W, 3] in [0, 1], composited over the render's background where it is transparent."""

@@ -29,13 +29,13 @@ from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConf
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
 from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
-from ssa_nerfstudio.plugin.kernel_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
+from ssa_nerfstudio.plugin.triton_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
 

@@ -81,7 +81,10 @@ def test_what_cannot_be_captured_is_repeated_plainly(monkeypatch, caplog):
 
     monkeypatch.setattr(in_place_graphs, "graphs_are_usable", lambda: True)
     monkeypatch.setattr(in_place_graphs, "CapturedPrograms", NoCapture)
-    total = torch.zeros(())
-    repeat(lambda: add(total), 5, torch.device("cuda"))
-    assert total.item() == 5
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    for device in ("cpu", "cuda:1", "cuda:0"):  # the last one alone is captured on
+        assert "CUDA graphs cannot be used" not in caplog.text
+        total = torch.zeros(())
+        repeat(lambda total=total: add(total), 5, torch.device(device))
+        assert total.item() == 5
     assert "CUDA graphs cannot be used" in caplog.text

@@ -61,6 +61,12 @@ def test_a_photo_is_reduced_as_upstream_reduces_it(model, downscales, reduction)
     assert_close(model.get_gt_img(photo).cpu(), expected)
 
 
+@pytest.mark.parametrize("image", [PHOTO[:47, :63], PHOTO[..., :1] > 0.5], ids=["odd", "bool"])
+def test_any_image_is_reduced_as_upstream_reduces_it(model, image):
+    model.config.num_downscales = 2
+    assert_close(model._downscale_if_required(image), resize_image(image, 4))
+
+
 def test_what_a_mask_excludes_is_no_part_of_the_loss(model):
     mask = torch.ones(48, 64, 1)
     mask[:, :20] = 0

@@ -28,7 +28,7 @@ def take_steps(
     count_steps(counters, 1 if verdict is None else verdict.taken)
     skipped = None if verdict is None else verdict.skipped
     per_optimizer = zip(optimizers, rates or [None] * len(optimizers), strict=True)
-    # A launch of torch's takes as long for a few thousand numbers as for a million: 65,536 of them are one block's.
+    # Torch gives each block of threads 65,536 numbers, so a small update takes as long as one of a million.
     side_by_side([partial(optimizer.update, skipped, rate=rate) for optimizer, rate in per_optimizer])
 
 

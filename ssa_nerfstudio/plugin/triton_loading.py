@@ -1,4 +1,4 @@
-"""What a first training step would wait for, loaded while photos are decoded."""
+"""Triton, for which the first training step would wait, loaded while photos are decoded."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def load_triton_meanwhile() -> None:
-    """Let a thread import Triton and hash its files, by whose sum it finds the kernels that it compiled before.
+    """Let a thread import Triton and hash its files, by whose hash it finds the kernels that it compiled before.
 
     Half a second that other threads can use, because hashing holds no lock.
     """
@@ -23,5 +23,5 @@ def _load_triton() -> None:
         from triton.runtime.cache import triton_key
 
         triton_key()
-    except (ImportError, OSError) as error:  # another version: the first step does it
+    except Exception as error:  # another version: the first step does it, and says what is wrong
         _LOG.debug(f"Triton was not loaded ahead: {error}")
