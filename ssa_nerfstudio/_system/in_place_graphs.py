@@ -17,30 +17,22 @@ from ssa_nerfstudio._system.cuda_graphs import (
 
 
 def repeat(program: Callable[[], object], times: int, device: torch.device) -> None:
-    """Run a program that changes tensors in place a number of times, more than two on CUDA as a graph.
+    """Run a program that changes tensors in place a number of times, on CUDA as a graph from the second time on.
 
     Args:
         program: it draws no random numbers, reads nothing from the device and launches the same kernels every time.
         times: at least 1.
         device: of the program's tensors, as they state it.
     """
-
-    def once() -> list[Tensor]:
-        program()
-        return []
-
-    program()
-    again: Callable[[], object] = program
     # A graph is captured from a stream of the current device: on another one, nothing would be in it.
-    if times > 2 and device.type == "cuda" and graphs_are_usable() and device.index == torch.cuda.current_device():
-        try:
-            _, again = CapturedPrograms().capture(once)
-        except RuntimeError as error:
-            warn_of_plain_launches(error)
-    for _ in range(times - 1):
-        again()
-    if again is not program:
-        torch.cuda.current_stream().synchronize()  # the graph must not be destroyed while it runs
+    if device.type != "cuda" or not graphs_are_usable() or device.index != torch.cuda.current_device():
+        for _ in range(times):
+            program()
+        return
+    changes = RecordedChanges()
+    for _ in range(times):
+        changes(program, key=None)
+    torch.cuda.current_stream().synchronize()  # the graph must not be destroyed while it runs
 
 
 def side_by_side(programs: Sequence[Callable[[], object]]) -> None:
@@ -77,26 +69,31 @@ class RecordedChanges:
         self._known: dict[Hashable, Callable[[], object] | None] = {}
         self._failed = False
 
-    def __call__(self, program: Callable[[], None], key: Hashable) -> None:
+    def __call__(self, program: Callable[[], object], key: Hashable) -> None:
         """Run a program once.
 
         Args:
             program: it launches the same kernels whenever the key is the same.
             key: the addresses and sizes of all tensors that it reads or changes, and what else it depends on.
         """
-        repeat = self._known.get(key)
-        if repeat is None and key in self._known and not self._failed:
+
+        def once() -> list[Tensor]:
+            program()
+            return []
+
+        recorded = self._known.get(key)
+        if recorded is None and key in self._known and not self._failed:
             try:
                 self._record = self._record or CapturedPrograms()
-                _, repeat = self._record.capture(lambda: program() or [])
-                self._known[key] = repeat
+                _, recorded = self._record.capture(once)
+                self._known[key] = recorded
             except RuntimeError as error:
                 self._failed = True
                 warn_of_plain_launches(error)
-        elif repeat is None:
+        elif recorded is None:
             self._known[key] = None
             if len(self._known) > self._limit:
                 del self._known[next(iter(self._known))]
                 if not any(self._known.values()):
                     self._record = None  # nothing can be captured into a pool whose last graph is gone
-        (repeat or program)()
+        (recorded or program)()

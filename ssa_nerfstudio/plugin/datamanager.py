@@ -31,7 +31,6 @@ from ssa_nerfstudio.plugin.view_geometry import metadata, prepare
 
 TRAINING_REDUCTIONS = (1, 2, 4, 8)
 """Factors by which splatfacto's resolution schedule reduces photos, for which intrinsics are kept ready."""
-
 MAX_DECODING_THREADS = 16
 """Each holds a photo and its undistortion, a tenth of a gigabyte for 12 megapixels."""
 
@@ -126,7 +125,7 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
             # Upstream pins memory for "cpu", which needs CUDA; "gpu" means the training device, here the CPU.
             cache_images_device = "gpu"
         try:
-            with _a_thread_per_core():
+            with _more_decoding_threads():
                 return super()._load_images(split, cache_images_device)
         except AssertionError as error:
             raise InputError(f"{error}", "write w and h in transforms.json as the photos are") from error
@@ -168,8 +167,8 @@ class SSADatamanager(FullImageDatamanager[PhotoDataset]):
 
 
 @contextmanager
-def _a_thread_per_core() -> Iterator[None]:
-    """Let upstream decode and undistort photos in a thread per core, instead of two; for one caller at a time."""
+def _more_decoding_threads() -> Iterator[None]:
+    """Let upstream decode and undistort photos in more threads than two; for one caller at a time."""
     upstream: Any = full_images_datamanager
     former, threads = upstream.ThreadPoolExecutor, min(MAX_DECODING_THREADS, usable_cores())
     upstream.ThreadPoolExecutor = lambda max_workers: former(max(max_workers, threads))

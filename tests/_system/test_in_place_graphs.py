@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import weakref
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -82,6 +83,7 @@ def test_what_cannot_be_captured_is_repeated_plainly(monkeypatch, caplog):
     monkeypatch.setattr(in_place_graphs, "graphs_are_usable", lambda: True)
     monkeypatch.setattr(in_place_graphs, "CapturedPrograms", NoCapture)
     monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda: SimpleNamespace(synchronize=lambda: None))
     for device in ("cpu", "cuda:1", "cuda:0"):  # the last one alone is captured on
         assert "CUDA graphs cannot be used" not in caplog.text
         total = torch.zeros(())
