@@ -8,6 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
+from ssa_nerfstudio._system.cores import usable_cores
+
 _pool: ThreadPoolExecutor | None = None
 
 
@@ -27,7 +29,7 @@ def on_all_threads(kernel: Callable, *arguments) -> None:
 def _executor() -> ThreadPoolExecutor:
     global _pool
     if _pool is None:
-        _pool = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="ssa-kernel")
+        _pool = ThreadPoolExecutor(max_workers=usable_cores(), thread_name_prefix="ssa-kernel")
     return _pool
 
 

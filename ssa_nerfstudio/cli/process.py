@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio._system.terminal_messages import plain_console
@@ -126,7 +127,7 @@ class Command:
         mask = self.mask and read_mask(self.mask, first.width, first.height, self.invert_mask)
         model = "OPENCV_FISHEYE" if self.projection == "fisheye" else "OPENCV"
         # More have no use, and COLMAP fails at numbers beyond what it can start or count.
-        threads, size = min(self.threads, os.cpu_count() or 1), min(self.max_image_size, MAX_PIXELS)
+        threads, size = min(self.threads, usable_cores()), min(self.max_image_size, MAX_PIXELS)
         settings = SfmSettings(self.matching, size, self.flatten, self.filter_stationary, model, threads)
         detect = self.detect or known is not None
         return sources, partial(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -16,6 +15,7 @@ from PIL import Image
 from rich.console import Console
 from rich.progress import track
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.ordered_map import ordered_map
 from ssa_nerfstudio.cameras.camera_names import camera_names
 from ssa_nerfstudio.cameras.groups import group_frames
@@ -100,7 +100,7 @@ def detect_artifacts(data: Path | str, frames: int = 200, threads: int | None = 
     Raises:
         InputError: no usable photos, too few of them, or one that cannot be decoded.
     """
-    threads = threads or os.cpu_count() or 1
+    threads = threads or usable_cores()
     return {camera.name: detect_camera(camera, threads) for camera in read_cameras(Path(data), frames)}
 
 

@@ -6,7 +6,6 @@ Features and matches that an earlier run stored in the database are kept.
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
 from collections.abc import Mapping, Sequence
@@ -17,6 +16,7 @@ import numpy as np
 import PIL.Image  # noqa: F401 - before pycolmap: loaded the other way round, saving a PNG aborts the process
 import pycolmap
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.process_lifetime import end_with_parent
 from ssa_nerfstudio.sfm import square_pixels
 from ssa_nerfstudio.sfm.false_joins import rejoin, torn_links
@@ -244,7 +244,7 @@ class StructureFromMotion:
 
     @property
     def _threads(self) -> int:
-        return self._settings.threads if self._settings.threads > 0 else os.cpu_count() or 1
+        return self._settings.threads if self._settings.threads > 0 else usable_cores()
 
 
 def _main(folder: Path) -> None:

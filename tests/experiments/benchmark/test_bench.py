@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import fcntl
-import os
 import shutil
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import pytest
 from conftest import at_work
 from made_results import benchmark, folder_of, result
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.experiments.benchmark.execution import worker_task
 from ssa_nerfstudio.experiments.benchmark.execution.dask_runner import DaskRunner
@@ -184,7 +184,7 @@ def test_on_a_gpu_a_process_is_ready_for_the_next_run_and_none_after_the_last(tm
 
     def watch(requests, waiting):
         for request in requests:
-            assert request.flip_processes == min(16, max(1, (os.cpu_count() or 1) // 2))
+            assert request.flip_processes == min(16, max(1, usable_cores() // 2))
             devices[request.run.id] = request.device
 
     def ended(run, result):

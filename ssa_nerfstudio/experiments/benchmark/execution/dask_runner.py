@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.execution.run_process import Request
@@ -125,7 +125,7 @@ class DaskRunner:
     def _flip_processes(self) -> int:
         """What the cores allow; 1 without a GPU, where a view takes longer to render than to compare."""
         at_once = len(self.devices) * self.runs_per_device if self.scheduler is None else 0
-        return max(1, min(FLIP_PROCESSES, (os.cpu_count() or 1) // at_once)) if at_once else 1
+        return max(1, min(FLIP_PROCESSES, usable_cores() // at_once)) if at_once else 1
 
     @contextmanager
     def _client(self) -> Iterator[Client]:
