@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 
 from ssa_nerfstudio.sfm.known_poses import MAX_ERROR, MIN_AGREEING, epipolar_errors
 
@@ -63,52 +65,40 @@ def rejoin(database: Path, images: Path, model: pycolmap.Reconstruction, folder:
     torn = [link for link in tree if _is_torn(link, model, points)]
     if not torn:
         return False
-    parts = _Parts()
-    for link in tree:
-        if link not in torn:
-            parts.join(*_frames(link, model))
+    part_of = _parts([link for link in tree if link not in torn], model)
     # Each part's pose in the world of the result; torn links and parts are trees, too.
     placed: dict[int, np.ndarray] = {}
     while torn:
-        link = next((link for link in torn if any(parts.of(frame) in placed for frame in _frames(link, model))), None)
+        link = next((link for link in torn if any(part_of[frame] in placed for frame in _frames(link, model))), None)
         if link is None:  # photos without a link to those before stay where they are
-            placed[parts.of(_frames(torn[0], model)[0])] = np.eye(4)
+            placed[part_of[_frames(torn[0], model)[0]]] = np.eye(4)
             continue
         torn.remove(link)
-        if parts.of(_frames(link, model)[0]) not in placed:
+        if part_of[_frames(link, model)[0]] not in placed:
             link = _Link((link.photos[1], link.photos[0]), link.matches[:, ::-1])
         moved = _move(link, model, points)
         if moved is None:
             return False
-        here, there = map(parts.of, _frames(link, model))
+        here, there = (part_of[frame] for frame in _frames(link, model))
         placed[there] = placed[here] @ moved
     result = pycolmap.Reconstruction(model)
     for frame in result.frames.values():
         if frame.has_pose():
-            part = pycolmap.Sim3d(placed.get(parts.of(frame.frame_id), np.eye(4))[:3])
+            part = pycolmap.Sim3d(placed.get(part_of[frame.frame_id], np.eye(4))[:3])
             frame.rig_from_world = part.transform_camera_world(frame.rig_from_world)
     folder.mkdir()
     pycolmap.triangulate_points(result, database, images, folder)
     return True
 
 
-class _Parts:
-    """Which frames belong together (union and find)."""
-
-    def __init__(self) -> None:
-        self._parents: dict[int, int] = {}
-
-    def of(self, frame: int) -> int:
-        """One frame that stands for all of a frame's part."""
-        while (parent := self._parents.get(frame, frame)) != frame:
-            self._parents[frame] = frame = self._parents.get(parent, parent)
-        return frame
-
-    def join(self, one: int, other: int) -> bool:
-        """Put the parts of both together; whether they were two."""
-        one, other = self.of(one), self.of(other)
-        self._parents[one] = other
-        return one != other
+def _parts(links: list[_Link], model: pycolmap.Reconstruction) -> dict[int, int]:
+    """The number of the part to which each frame with a pose belongs, where links connect the frames of a part."""
+    frames = [number for number, frame in model.frames.items() if frame.has_pose()]
+    place = {frame: at for at, frame in enumerate(frames)}
+    ends = np.array([[place[frame] for frame in _frames(link, model)] for link in links], dtype=np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(ends)), ends.T), shape=(len(frames), len(frames)))
+    _, labels = connected_components(graph, directed=False)
+    return dict(zip(frames, labels.tolist(), strict=True))
 
 
 def _frames(link: _Link, model: pycolmap.Reconstruction) -> tuple[int, int]:
@@ -126,9 +116,15 @@ def _tree(database: Path, model: pycolmap.Reconstruction) -> list[_Link]:
     ]
     posed = {number for number, image in model.images.items() if image.has_pose}
     links = [link for link in links if len(link.matches) >= _MIN_MATCHES and posed.issuperset(link.photos)]
-    parts = _Parts()
-    links.sort(key=lambda link: len(link.matches), reverse=True)
-    return [link for link in links if parts.join(*_frames(link, model))]
+    # Of two frames of rigs the photos with the most matches; none of two photos of one frame.
+    strongest = {frozenset(_frames(link, model)): link for link in sorted(links, key=lambda link: len(link.matches))}
+    between = {tuple(sorted(frames)): link for frames, link in strongest.items() if len(frames) == 2}
+    frames = np.unique(np.array([*between], dtype=np.int64))
+    ends = np.searchsorted(frames, np.array([*between], dtype=np.int64).reshape(-1, 2))
+    # Fewest are the least: a minimum spanning tree of the inverse numbers.
+    costs = [1 / len(link.matches) for link in between.values()]
+    tree = minimum_spanning_tree(coo_array((costs, ends.T), shape=(len(frames), len(frames)))).tocoo()
+    return [between[frames[i], frames[j]] for i, j in zip(tree.row, tree.col, strict=True)]
 
 
 def _points(model: pycolmap.Reconstruction) -> dict[int, np.ndarray]:
