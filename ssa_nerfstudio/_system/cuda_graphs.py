@@ -1,4 +1,4 @@
-"""Functions of fixed shapes as CUDA graphs: one launch for their values, one for their gradients.
+"""Functions of fixed shapes as CUDA graphs: one launch for their values, one for their gradients, or one for both.
 
 A training step of splats waits for its host, which launches some hundred kernels one by one. With SSA_CUDA_GRAPHS=0 it
 still does so; the kernels are the same.
@@ -12,17 +12,18 @@ import os
 from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 Function = Callable[..., tuple[Tensor, ...]]
 """Of tensors. It draws no random numbers, reads nothing from the device and launches the same kernels at every call."""
 Program = Callable[[], list[Tensor]]
 Record = Callable[[Program], tuple[list[Tensor], Callable[[], object]]]
 """Records a program: where its results are going to be, and what computes them there, any number of times."""
+Gradients = tuple[Sequence[Tensor | None], Sequence[Tensor | None]]
+"""Of inputs and of parameters; None where there is none."""
+Differentiate = Callable[[Sequence[Tensor | None]], Gradients]
 _LOG = logging.getLogger(__name__)
 
 
@@ -87,15 +88,66 @@ def _capture_stream(device: int) -> torch.cuda.Stream:
     return torch.cuda.Stream(device)
 
 
+class Evaluation:
+    """Values of a function that autograd does not know of, and its gradient, which is taken by hand and once.
+
+    A node of autograd costs the host a tenth of a millisecond, more than to launch a recording.
+    """
+
+    def __init__(self, values: list[Tensor], parameters: Sequence[Tensor], differentiate: Differentiate) -> None:
+        """Make one.
+
+        Args:
+            values: without history.
+            parameters: those that receive gradients.
+            differentiate: of the slopes of the values; the gradients of the inputs and those of the parameters.
+        """
+        self.values = values
+        self._parameters, self._differentiate = parameters, differentiate
+
+    def backpropagate(self, slopes: Sequence[Tensor | None] = ()) -> Sequence[Tensor | None]:
+        """Add the gradient to that of the parameters.
+
+        Args:
+            slopes: derivatives with respect to the values, None for those that nothing depends on; of a sum none.
+
+        Returns:
+            The gradients of the inputs.
+        """
+        of_inputs, of_parameters = self._differentiate(slopes)
+        for parameter, gradient in zip(self._parameters, of_parameters):  # noqa: B905 - at every step
+            if gradient is not None:
+                parameter.grad = gradient if parameter.grad is None else parameter.grad + gradient
+        return of_inputs
+
+
+def evaluate(function: Function, inputs: Sequence[Tensor], parameters: Sequence[Tensor], of_sum: bool) -> Evaluation:
+    """Call a function without a recording; arguments as of `RecordedFunction`."""
+    with torch.enable_grad():
+        leaves = [each.detach().requires_grad_(each.requires_grad) for each in inputs]
+        computed = function(*leaves, *parameters)
+
+    def differentiate(slopes: Sequence[Tensor | None]) -> Gradients:
+        given = [None] * len(computed) if of_sum else slopes
+        wanted = [(v, s) for v, s in zip(computed, given, strict=True) if v.requires_grad and (of_sum or s is not None)]
+        # Into the parameters' gradients at once, because autograd brings them into the parameters' layout.
+        learned = [each for each in (*leaves, *parameters) if each.requires_grad]
+        torch.autograd.backward([v for v, _ in wanted], [s for _, s in wanted], inputs=learned)
+        return [each.grad for each in leaves], []
+
+    values = [each.detach().requires_grad_(each.requires_grad and not of_sum) for each in computed]
+    return Evaluation(values, parameters, differentiate)
+
+
 class RecordedFunction:
-    """A function that was recorded once and is repeated in place, differentiable once.
+    """A function that was recorded once and is repeated in place.
 
     Inputs are copied to where they were when it was recorded; parameters are read where they are. Values and gradients
     are valid until the next call, which puts its own in their place.
     """
 
     def __init__(
-        self, function: Function, inputs: Sequence[Tensor], parameters: Sequence[Tensor], record: Record
+        self, function: Function, inputs: Sequence[Tensor], parameters: Sequence[Tensor], record: Record, of_sum: bool
     ) -> None:
         """Record a function.
 
@@ -104,94 +156,95 @@ class RecordedFunction:
             inputs: with the shapes, types and needs of a gradient of all later calls.
             parameters: their memory must not move; the objects may be replaced.
             record: `CapturedPrograms`, or what repeats programs on a CPU in a test.
+            of_sum: the gradient that is wanted is that of the sum of all values that have one, scalars. It is computed
+                with the values, in one launch.
         """
-        self.calls = 0
+        self._calls = 0
         self._inputs = [each.detach().clone().requires_grad_(each.requires_grad) for each in inputs]
         # Under other names, because autograd would wait for the stream on which a parameter was used before.
         aliases = [each.detach().requires_grad_(each.requires_grad) for each in parameters]
         arguments = [*self._inputs, *aliases]
         leaves = [each for each in arguments if each.requires_grad]
+        one = torch.ones((), device=arguments[0].device)
         computed: list[Tensor] = []
+        used: list[bool] = []
 
         def compute() -> list[Tensor]:
             with torch.enable_grad():
                 computed[:] = function(*arguments)
             return [each.detach() for each in computed]
 
-        def differentiate() -> list[Tensor]:
+        def differentiate(again: bool = True) -> list[Tensor]:
             values = [each for each in computed if each.requires_grad]
-            # The graph is kept, because a record runs a program more than once.
-            found = torch.autograd.grad(values, leaves, self._slopes, retain_graph=True, allow_unused=True)
+            slopes = [one] * len(values) if of_sum else self._slopes
+            # The graph is kept where a record runs this program more than once.
+            found = torch.autograd.grad(values, leaves, slopes, retain_graph=again, allow_unused=True)
             used[:] = [each is not None for each in found]
             return [each.contiguous() for each in found if each is not None]
 
-        used: list[bool] = []
-        self._values, self._recompute = record(compute)
-        self._recompute()
-        self._differentiable = [each.requires_grad for each in computed]
-        self._slopes = [torch.zeros_like(each) for each in computed if each.requires_grad]
-        gradients, self._rederive = record(differentiate)
-        found = iter(gradients)
-        of_leaves = iter([next(found) if each else None for each in used])
-        self._gradients = [next(of_leaves) if each.requires_grad else None for each in arguments]
+        if of_sum:
+            found, self._recompute = record(lambda: [*compute(), *differentiate(again=False)])
+            self._values, gradients = found[: len(computed)], found[len(computed) :]
+        else:
+            self._values, self._recompute = record(compute)
+            self._recompute()
+            self._slopes = [torch.zeros_like(each) for each in computed if each.requires_grad]
+            gradients, self._rederive = record(differentiate)
+        self._of_sum = of_sum
+        self._smooth = [each.requires_grad for each in computed]
+        each_found = iter(gradients)
+        of_leaves = iter([next(each_found) if each else None for each in used])
+        found_of = [next(of_leaves) if each.requires_grad else None for each in arguments]
+        self._gradients = found_of[: len(inputs)], found_of[len(inputs) :]
         computed.clear()
 
-    def __call__(self, *tensors: Tensor) -> tuple[Tensor, ...]:
-        """The function's values, connected by autograd to the inputs and parameters that are given.
+    def __call__(self, inputs: Sequence[Tensor], parameters: Sequence[Tensor]) -> Evaluation:
+        """Evaluate the function.
 
         Parameters may be other objects than those that were recorded: gsplat's relocation puts new ones around the same
         memory.
         """
-        return _Repeated.apply(self, *tensors)  # pyright: ignore[reportReturnType]
-
-    def values(self, inputs: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
-        """All values for given inputs, and those of them that have no gradient."""
         _copy(self._inputs, inputs)
         self._recompute()
-        self.calls += 1
-        values = [each.detach() for each in self._values]
-        return values, [each for each, smooth in zip(values, self._differentiable, strict=True) if not smooth]
+        self._calls += 1
+        call = self._calls
+        if self._of_sum:
+            values = [each.detach() for each in self._values]
+        else:
+            values = [each.detach().requires_grad_(smooth) for each, smooth in zip(self._values, self._smooth)]  # noqa: B905
 
-    def gradients(self, slopes: Sequence[Tensor | None]) -> list[Tensor | None]:
-        """Gradients of inputs and parameters, given those of the values that were computed last."""
-        wanted = [each for each, smooth in zip(slopes, self._differentiable, strict=True) if smooth]
-        for mine, given in zip(self._slopes, wanted, strict=True):
+        def differentiate(slopes: Sequence[Tensor | None]) -> Gradients:
+            if call != self._calls:
+                raise RuntimeError(
+                    "a recorded function was called again before the gradient of its last call was taken"
+                )
+            return self._gradients if self._of_sum else self._differentiated(slopes)
+
+        return Evaluation(values, parameters, differentiate)
+
+    def _differentiated(self, slopes: Sequence[Tensor | None]) -> Gradients:
+        wanted = [each for each, smooth in zip(slopes, self._smooth, strict=True) if smooth]
+        for mine, given in zip(self._slopes, wanted):  # noqa: B905
             if given is None:
                 mine.zero_()
-        pairs = [pair for pair in zip(self._slopes, wanted, strict=True) if pair[1] is not None]
-        _copy([mine for mine, _ in pairs], [given for _, given in pairs if given is not None])
+        pairs = [(mine, given) for mine, given in zip(self._slopes, wanted) if given is not None]  # noqa: B905
+        _copy([mine for mine, _ in pairs], [given for _, given in pairs])
         self._rederive()
-        return [None if each is None else each.detach() for each in self._gradients]
-
-
-class _Repeated(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, recorded: RecordedFunction, *tensors: Tensor) -> tuple[Tensor, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        values, constant = recorded.values(tensors)
-        ctx.recorded, ctx.call = recorded, recorded.calls
-        ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(*constant)
-        return tuple(values)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx, *slopes: Tensor | None) -> tuple[Any, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if ctx.call != ctx.recorded.calls:
-            raise RuntimeError("a recorded function was called again before the gradient of its last call was taken")
-        return None, *ctx.recorded.gradients(slopes)
+        return self._gradients
 
 
 class RecordedCalls:
-    """Calls functions plainly at first, and from the second call of a kind on as a recording."""
+    """Evaluates functions plainly at first, and from the second call of a kind on as a recording."""
 
-    def __init__(self, record: Callable[[], Record], limit: int = 8) -> None:
+    def __init__(self, record: Callable[[], Record], of_sum: bool = False, limit: int = 8) -> None:
         """Record nothing yet.
 
         Args:
             record: makes what records, once for each epoch.
+            of_sum: as of `RecordedFunction`.
             limit: number of recordings that are kept; what comes after them is called plainly.
         """
-        self._make_record, self._limit = record, limit
+        self._make_record, self._of_sum, self._limit = record, of_sum, limit
         self._record: Record | None = None
         self._epoch: Hashable = None
         self._known: dict[Hashable, RecordedFunction | None] = {}
@@ -204,36 +257,37 @@ class RecordedCalls:
         parameters: Sequence[Tensor],
         kind: Hashable,
         epoch: Hashable = None,
-    ) -> tuple[Tensor, ...]:
-        """The function's values.
+    ) -> Evaluation:
+        """Evaluate a function.
 
         Args:
             function, inputs, parameters: as of `RecordedFunction`.
             kind: all that a recording depends on beside the inputs' values.
             epoch: recordings of another one, or of parameters that have moved, are dropped.
         """
-        plain = self._failed or torch.is_autocast_enabled() or any(each.grad is not None for each in parameters)
-        if plain or not torch.is_grad_enabled():  # gradients that accumulate would be written over
-            return function(*inputs, *parameters)
-        epoch = epoch, *((each.data_ptr(), each.shape) for each in parameters)
+        # A gradient that accumulates may be a recording's own, which its next call writes over.
+        if self._failed or torch.is_autocast_enabled() or any(each.grad is not None for each in parameters):
+            return evaluate(function, inputs, parameters, self._of_sum)
+        epoch = epoch, *[(each.data_ptr(), each.shape) for each in parameters]
         if epoch != self._epoch:
             self.forget()
             self._epoch = epoch
-        kind = (kind, *((each.shape, each.dtype) for each in inputs))
-        if kind not in self._known:
-            if len(self._known) < self._limit:
-                self._known[kind] = None
-            return function(*inputs, *parameters)
-        recorded = self._known[kind]
+        kind = kind, *[(each.shape, each.dtype) for each in inputs]
+        recorded = self._known.get(kind)
         if recorded is None:
+            if kind not in self._known:
+                if len(self._known) < self._limit:
+                    self._known[kind] = None
+                return evaluate(function, inputs, parameters, self._of_sum)
             try:
                 self._record = self._record or self._make_record()
-                recorded = self._known[kind] = RecordedFunction(function, inputs, parameters, self._record)
+                recorded = RecordedFunction(function, inputs, parameters, self._record, self._of_sum)
+                self._known[kind] = recorded
             except RuntimeError as error:
                 self._failed, self._known = True, {}
                 warn_of_plain_launches(error)
-                return function(*inputs, *parameters)
-        return recorded(*inputs, *parameters)
+                return evaluate(function, inputs, parameters, self._of_sum)
+        return recorded(inputs, parameters)
 
     def forget(self) -> None:
         """Drop all recordings, and with them their memory and that of the parameters that they were made of."""

@@ -162,7 +162,7 @@ class SSASplatfactoModel(PhotoLosses):
             return self._controls.outputs(drawn, camera, width, height) if len(self.artifacts) else drawn
         if self.training:
             view = metadata(camera).get("cam_idx")
-            return {**drawn, "view": view} if "color" in drawn else self._with_photo(drawn, view)
+            return {**drawn, "view": view} if "render" in drawn else self._with_photo(drawn, view)
         if len(self.artifacts):
             layers = self.artifacts.layers_of_camera(camera, width, height)
             if layers is None:  # one camera of several: a mean over all needs its composite, too
@@ -184,7 +184,8 @@ class SSASplatfactoModel(PhotoLosses):
         if self.config.sh_degree > 0:
             sh_degree = min(self.step // self.config.sh_degree_interval, self.config.sh_degree)
         with_depth = self.config.output_depth_during_training or not self.training
-        render, alpha, self.info = self._draw(
+        recorded = self._losses_are_recorded(with_depth)
+        render = (self._draw.learned if recorded else self._draw)(
             gaussians,
             self._view_matrix(camera),
             intrinsics(camera, reduction),
@@ -196,15 +197,16 @@ class SSASplatfactoModel(PhotoLosses):
             absgrad=self.strategy.absgrad,
             rasterize_mode=self.config.rasterize_mode,
         )
+        image, alpha, self.info = render[:3]
         if self.training:
             self.strategy.step_pre_backward(
                 self.gauss_params, self.optimizers, self.strategy_state, self.step, self.info
             )
         background = self._get_background_color()
+        if recorded:
+            return {"render": render, "background": background}
         # squeeze, because the gradient of an index or a slice fills a frame with zeros first
-        accumulation, color = alpha.squeeze(0), render.squeeze(0)
-        if self._losses_are_recorded(with_depth):
-            return {"color": color, "accumulation": accumulation, "background": background}
+        accumulation, color = alpha.squeeze(0), image.squeeze(0)
         if with_depth:
             color = color[..., :3]
         white = BRIGHTEST if self.training and self.exposure is not None else 1.0
@@ -213,7 +215,7 @@ class SSASplatfactoModel(PhotoLosses):
             rgb = self._apply_bilateral_grid(rgb[None], metadata(camera)["cam_idx"], height, width)[0]
         depth = None
         if with_depth:
-            depth = torch.where(accumulation > 0, render[0, ..., 3:], render[..., 3].detach().max())
+            depth = torch.where(accumulation > 0, image[0, ..., 3:], image[..., 3].detach().max())
         return {
             "rgb": rgb,
             "depth": depth,
@@ -232,7 +234,7 @@ class SSASplatfactoModel(PhotoLosses):
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's loss: photometric on the composite, sparsity of the matte, and the strategy's own terms."""
-        losses = self._photo_losses(outputs, batch) if "rgb" in outputs else self._recorded_losses(outputs, batch)
+        losses = self._recorded_losses(outputs, batch) if "render" in outputs else self._photo_losses(outputs, batch)
         if not self.training:
             return losses
         losses |= regularizers(self.config, self.scales, self.opacities, self.step)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from nerfstudio.models.splatfacto import SplatfactoModel
@@ -17,6 +17,7 @@ from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
 from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.splat_rendering import LearnedRender
 
 
 class PhotoLosses(SplatfactoModel):
@@ -25,13 +26,14 @@ class PhotoLosses(SplatfactoModel):
     config: ModelSettings
     artifacts: Artifacts
     exposure: Exposure | None
-    recordable: ClassVar[bool] = True
-    """Whether nothing but `_photo_losses` reads the pictures of a training step, so that they need not be there."""
+    recordable: bool = True
+    """Whether nothing but `_photo_losses` reads the pictures of a training step, so that they need not be there, and
+    the sum of the losses is what is minimized, not a multiple of it."""
 
     def populate_modules(self) -> None:
         """Build splatfacto's modules, and nothing that is recorded yet."""
         super().populate_modules()
-        self._recorded = RecordedCalls(CapturedPrograms)
+        self._recorded = RecordedCalls(CapturedPrograms, of_sum=True)
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Convert a photo to [0, 1], in one pass over uint8 instead of two.
@@ -64,11 +66,16 @@ class PhotoLosses(SplatfactoModel):
         return losses
 
     def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
-        """`_photo_losses` of a view of which only the splats were drawn, as one CUDA graph; draws the rest, too."""
-        photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
-        splats = [drawn[name] for name in ("color", "accumulation", "background")]
+        """`_photo_losses` of a view of which only the splats were drawn, as one CUDA graph; draws the rest, too.
 
-        def compute(color: Tensor, accumulation: Tensor, background: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+        What is learned has its gradient afterwards, and the losses have no history: autograd knows of the blending
+        alone.
+        """
+        render: LearnedRender = drawn.pop("render")
+        photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
+
+        def compute(image: Tensor, alpha: Tensor, background: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
+            color, accumulation = image.squeeze(0), alpha.squeeze(0)
             rgb = clean_image(color, accumulation, background, 1.0)
             shown = {"rgb": rgb, "accumulation": accumulation, "background": background}
             with parameters_replaced(self.artifacts, others[len(photo) :]):
@@ -80,9 +87,12 @@ class PhotoLosses(SplatfactoModel):
         view = drawn["view"] if len(self.artifacts) else None
         kind = None if view is None else self.artifacts.group_of_view(view), tuple(photo)
         parameters, reduction = list(self.artifacts.parameters()), self._get_downscale_factor()
-        values = self._recorded(compute, [*splats, *photo.values()], parameters, kind, reduction)
+        given = [render.image, render.alpha, drawn["background"], *photo.values()]
+        evaluated = self._recorded(compute, given, parameters, kind, reduction)
+        of_image, of_alpha, *_ = evaluated.backpropagate()
+        render.backpropagate(of_image, of_alpha)
         names = ["main_loss", *["sparsity"] * self._sparsity_counts(), "rgb", "composite"]
-        found = dict(zip(names, values))  # noqa: B905 - there may be no composite
+        found = dict(zip(names, evaluated.values))  # noqa: B905 - there may be no composite
         drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
         return found
 
@@ -106,4 +116,4 @@ class PhotoLosses(SplatfactoModel):
     def _can_be_recorded(self, with_depth: bool) -> bool:
         """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
         settings = with_depth or self.config.use_bilateral_grid or self.exposure is not None
-        return self.training and self.recordable and not settings
+        return self.training and self.recordable and torch.is_grad_enabled() and not settings

@@ -8,12 +8,12 @@ view to view. A refinement makes other Gaussians, and with them new recordings.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, Evaluation, RecordedCalls
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
 from ssa_nerfstudio.rasterization.constants import EPS2D, FAR_PLANE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, info_of
@@ -23,6 +23,26 @@ PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_
 MOST_RECORDED = 250_000
 """Gaussians up to which a projection is recorded: the more there are, the less a step waits for its host, and a
 recording keeps copies of their gradients. Source: docs/results.md, "Large scenes"."""
+
+
+class LearnedRender(NamedTuple):
+    """A render of a training view, from where its gradient goes back to the parameters of the Gaussians."""
+
+    image: Tensor  # [1, H, W, 3], over nothing
+    alpha: Tensor  # [1, H, W, 1]
+    info: dict[str, Any]  # see `interface.make_rasterization`
+    views: tuple[Tensor, ...] = ()  # the projection's inputs
+    projection: Evaluation | None = None  # None: autograd knows of it
+
+    def backpropagate(self, of_image: Tensor | None, of_alpha: Tensor | None) -> None:
+        """Add to the gradients of all that is learned, given those of the image and of alpha; once."""
+        found = [pair for pair in ((self.image, of_image), (self.alpha, of_alpha)) if pair[1] is not None]
+        torch.autograd.backward([value for value, _ in found], [slope for _, slope in found])
+        if self.projection is not None:
+            of_views = self.projection.backpropagate([value.grad for value in self.projection.values])
+            for view, gradient in zip(self.views, of_views, strict=True):
+                if gradient is not None:  # of a camera that is learned
+                    view.backward(gradient)
 
 
 class SplatRenderer:
@@ -49,21 +69,39 @@ class SplatRenderer:
             options: near_plane, sh_degree, render_mode, absgrad and rasterize_mode.
         """
         device = parameters["means"].device
-        learning = torch.is_grad_enabled() and options["render_mode"] == "RGB"
-        if len(parameters["means"]) > MOST_RECORDED:
-            # Those of fewer, before the last refinement.
-            self.projections.forget()
-        if learning and device.type == "cuda" and self._name in ("auto", "gsplat"):
-            antialiased = options.pop("rasterize_mode") == "antialiased"
-            settings = RenderOptions(
-                far_plane=FAR_PLANE, radius_clip=0.0, eps2d=EPS2D, antialiased=antialiased, **options
-            )
-            cameras = Cameras(viewmats, Ks, width, height, None)
-            recorded = graphs_are_usable() and len(parameters["means"]) <= MOST_RECORDED
-            return render_learned(self.projections if recorded else None, parameters, cameras, settings)
+        if torch.is_grad_enabled() and options["render_mode"] == "RGB" and self._is_gsplat(device):
+            return render_learned(None, parameters, Cameras(viewmats, Ks, width, height, None), _settings(options))[:3]
         gaussians = activated(parameters, options["sh_degree"] is not None)
         draw = rasterizer(self._name, device)
         return draw(**gaussians._asdict(), viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
+
+    def learned(
+        self,
+        parameters: Mapping[str, Tensor],
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        **options: Any,
+    ) -> LearnedRender:
+        """Render a training view, on CUDA with a recorded projection; arguments as of a call, with render_mode RGB."""
+        count, device = len(parameters["means"]), parameters["means"].device
+        if count > MOST_RECORDED:
+            self.projections.forget()  # those of fewer, before the last refinement
+        if count > MOST_RECORDED or not self._is_gsplat(device):
+            return LearnedRender(*self(parameters, viewmats, Ks, width, height, **options))
+        return render_learned(
+            self.projections, parameters, Cameras(viewmats, Ks, width, height, None), _settings(options)
+        )
+
+    def _is_gsplat(self, device: torch.device) -> bool:
+        return device.type == "cuda" and self._name in ("auto", "gsplat")
+
+
+def _settings(options: Mapping[str, Any]) -> RenderOptions:
+    given = {name: value for name, value in options.items() if name != "rasterize_mode"}
+    antialiased = options["rasterize_mode"] == "antialiased"
+    return RenderOptions(far_plane=FAR_PLANE, radius_clip=0.0, eps2d=EPS2D, antialiased=antialiased, **given)
 
 
 def activated(parameters: Mapping[str, Tensor], with_harmonics: bool) -> Gaussians:
@@ -78,17 +116,14 @@ def render_learned(
     parameters: Mapping[str, Tensor],
     cameras: Cameras,
     options: RenderOptions,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:
+) -> LearnedRender:
     """Render for a training step with gsplat's kernels, and one of ours for the harmonics.
 
     Args:
-        calls: records the projection; None: its kernels are launched one by one.
+        calls: records the projection; None: its kernels are launched one by one, and autograd knows of them.
         parameters: of N Gaussians, `PARAMETERS`.
         cameras: one, without a background.
         options: with `render_mode` RGB.
-
-    Returns:
-        As of `interface.make_rasterization`.
     """
     from ssa_nerfstudio.rasterization import cuda, harmonics
 
@@ -110,10 +145,12 @@ def render_learned(
 
     learned = [parameters[name] for name in PARAMETERS]
     with_colors = degree is None or harmonics.runs_on_current_stream(learned[0].device, degree)
-    views, kind = [cameras.viewmats, cameras.Ks], (cameras.width, cameras.height, *vars(options).values())
+    views, kind = (cameras.viewmats, cameras.Ks), (cameras.width, cameras.height, *vars(options).values())
     # A training does not go back to a degree.
-    found = calls(compute, views, learned, kind, epoch=degree) if calls else compute(*views, *learned)
+    projection = calls(compute, views, learned, kind, epoch=degree) if calls else None
+    found = projection.values if projection else compute(*views, *learned)
     projected = cuda.Projected(*found[: len(cuda.Projected._fields)])
     channels = found[-1] if with_colors else colors_of(cameras.viewmats, projected.radii, learned)
     image, alpha = cuda.blend(projected, channels, cameras, options)
-    return image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height)
+    info = info_of(projected.radii, projected.means2d, cameras.width, cameras.height)
+    return LearnedRender(image, alpha, info, views, projection)

@@ -114,6 +114,8 @@ class SSATrainer(Trainer):
     def setup_optimizers(self) -> JointOptimizers:
         """Optimizers of the configuration; the means' learning rate in units of the scene where the model asks so."""
         self.pipeline.model.metrics_every = max(1, self.config.logging.steps_per_log)
+        if self.grad_scaler.is_enabled():
+            self.pipeline.model.recordable = False  # gradients are of a multiple of the loss
         scale = self.pipeline.model.scene_scale
         if scale != 1.0:
             means = self.config.optimizers["means"]
@@ -231,9 +233,10 @@ class SSATrainer(Trainer):
         with torch.autocast(device_type="cuda" if "cuda" in self.device else "cpu", enabled=self.mixed_precision):
             _, losses, metrics = self.pipeline.get_train_loss_dict(step=step)
             loss = reduce(torch.add, losses.values())
-        if self._one is None:
-            self._one = torch.ones_like(loss, requires_grad=False)
-        self.grad_scaler.scale(loss).backward(self._one)  # without one, autograd fills one in at every step
+        if loss.requires_grad:  # not what a recording has differentiated already
+            if self._one is None:
+                self._one = torch.ones_like(loss, requires_grad=False)
+            self.grad_scaler.scale(loss).backward(self._one)  # without one, autograd fills one in at every step
         loss = loss.detach()
         due = [name for name in optimizers.parameters if step % every[name] == every[name] - 1]
         optimizers.step_groups(due, loss, self.grad_scaler)

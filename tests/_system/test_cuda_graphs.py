@@ -7,7 +7,7 @@ import torch
 from recordings import CUDA, recorder, run_again
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, RecordedFunction
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, Evaluation, RecordedCalls, RecordedFunction, evaluate
 
 
 class Mixture:
@@ -32,54 +32,101 @@ class Mixture:
         return error.square().mean(), (error > 0).sum(), shown.sum(dim=1)
 
 
-def outcome(function, mixture: Mixture, inputs: list[Tensor], slope: float) -> list[Tensor | None]:
+def outcome(mixture: Mixture, inputs: list[Tensor], slope: float) -> list[Tensor | None]:
+    """Values and gradients by autograd."""
     mixture.weights.grad = inputs[0].grad = None
-    value, count, sums = function(*inputs)
+    value, count, sums = mixture(*inputs)
     (slope * value + sums[1] * sums[2]).backward()
-    assert not count.requires_grad
-    return [v if v is None else v.detach().clone() for v in (value, count, sums, inputs[0].grad, mixture.weights.grad)]
+    return copies([value, count, sums, inputs[0].grad, mixture.weights.grad])
+
+
+def found(evaluation: Evaluation, mixture: Mixture, slope: float) -> list[Tensor | None]:
+    """The same of an evaluation."""
+    value, count, sums = leaves = evaluation.values
+    assert [each.requires_grad for each in leaves] == [True, False, True]
+    (slope * value + sums[1] * sums[2]).backward()
+    of_inputs = evaluation.backpropagate([each.grad for each in leaves])
+    assert of_inputs[1] is None
+    assert of_inputs[2] is None
+    return copies([value, count, sums, of_inputs[0], mixture.weights.grad])
+
+
+def copies(values: list[Tensor | None]) -> list[Tensor | None]:
+    return [each if each is None else each.detach().clone() for each in values]
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
-def test_a_recorded_function_has_the_values_and_gradients_of_the_plain_one(device):
+@pytest.mark.parametrize("plain", [False, True])
+def test_an_evaluation_has_the_values_and_gradients_of_autograd(device, plain):
     mixture = Mixture(device)
     parameters = [mixture.weights, mixture.unused]
-    recorded = RecordedFunction(mixture, mixture.inputs(), parameters, recorder(device)())
+    recorded = RecordedFunction(mixture, mixture.inputs(), parameters, recorder(device)(), of_sum=False)
     for step in range(3):
         with torch.no_grad():
             mixture.weights.add_(0.1)  # as an optimizer does, in place
         inputs = mixture.inputs()
         for slope in (1.0, 2.0 + step):
-            torch.testing.assert_close(
-                outcome(lambda *given: recorded(*given, *parameters), mixture, inputs, slope),
-                outcome(mixture, mixture, inputs, slope),
-            )
+            expected = outcome(mixture, inputs, slope)
+            mixture.weights.grad = None
+            evaluation = evaluate(mixture, inputs, parameters, False) if plain else recorded(inputs, parameters)
+            torch.testing.assert_close(found(evaluation, mixture, slope), expected)
     assert mixture.unused.grad is None
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
-def test_a_value_that_nothing_depends_on_has_no_slope(device):
+@pytest.mark.parametrize("plain", [False, True])
+def test_the_gradient_of_a_sum_comes_with_its_values(device, plain):
     mixture = Mixture(device)
-    inputs = mixture.inputs()
-    recorded = RecordedFunction(mixture, inputs, [mixture.weights], recorder(device)())
-    for _ in range(2):  # the second follows a call whose sums had a slope
-        outcome(lambda *given: recorded(*given, mixture.weights), mixture, inputs, 1.0)
+    parameters = [mixture.weights, mixture.unused]
+
+    def terms(*given: Tensor) -> tuple[Tensor, ...]:
+        value, count, sums = mixture(*given)
+        return value, sums.square().mean(), count, sums.detach()
+
+    recorded = RecordedFunction(terms, mixture.inputs(), parameters, recorder(device)(), of_sum=True)
+    for _ in range(3):
+        inputs = mixture.inputs()
+        value, other, *rest = terms(*inputs)
         mixture.weights.grad = None
-        recorded(*inputs, mixture.weights)[0].backward()
+        (value + other).backward()
+        expected = copies([value, other, *rest, inputs[0].grad, mixture.weights.grad])
+        mixture.weights.grad = None
+        evaluation = evaluate(terms, inputs, parameters, True) if plain else recorded(inputs, parameters)
+        assert not any(each.requires_grad for each in evaluation.values)
+        of_inputs = evaluation.backpropagate()
+        torch.testing.assert_close(copies([*evaluation.values, of_inputs[0], mixture.weights.grad]), expected)
+    assert mixture.unused.grad is None
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
+@pytest.mark.parametrize("plain", [False, True])
+def test_a_value_that_nothing_depends_on_has_no_slope(device, plain):
+    mixture = Mixture(device)
+    inputs, parameters = mixture.inputs(), [mixture.weights]
+    recorded = RecordedFunction(mixture, inputs, parameters, recorder(device)(), of_sum=False)
+
+    def call() -> Evaluation:
+        return evaluate(mixture, inputs, parameters, False) if plain else recorded(inputs, parameters)
+
+    for _ in range(2):  # the second follows a call whose sums had a slope
+        found(call(), mixture, 1.0)
+        mixture.weights.grad = None
+        call().backpropagate([torch.ones((), device=device), None, None])
         assert mixture.weights.grad is not None
-        found, mixture.weights.grad = mixture.weights.grad.clone(), None
+        gradient, mixture.weights.grad = mixture.weights.grad.clone(), None
         mixture(*inputs)[0].backward()
-        torch.testing.assert_close(found, mixture.weights.grad)
+        torch.testing.assert_close(gradient, mixture.weights.grad)
+        mixture.weights.grad = None
 
 
 def test_a_gradient_after_another_call_is_refused():
     mixture = Mixture("cpu")
-    inputs = mixture.inputs()
-    recorded = RecordedFunction(mixture, inputs, [mixture.weights], run_again())
-    first = recorded(*inputs, mixture.weights)[0]
-    recorded(*inputs, mixture.weights)
+    inputs, parameters = mixture.inputs(), [mixture.weights]
+    recorded = RecordedFunction(mixture, inputs, parameters, run_again(), of_sum=False)
+    first = recorded(inputs, parameters)
+    recorded(inputs, parameters)
     with pytest.raises(RuntimeError, match="called again"):
-        first.backward()
+        first.backpropagate([torch.ones(()), None, None])
 
 
 class Counted:
@@ -103,12 +150,11 @@ def test_every_kind_is_recorded_at_its_second_call_and_anew_in_another_epoch(dev
     mixture, made = Mixture(device), Counted(recorder(device))
     calls = RecordedCalls(made, limit=2)
     inputs, parameters = mixture.inputs(), [mixture.weights]
-    expected = outcome(mixture, mixture, inputs, 3.0)
+    expected = outcome(mixture, inputs, 3.0)
 
     def call(kind: str, epoch: int) -> int:
-        before = made.programs
-        found = outcome(lambda *given: calls(mixture, given, parameters, kind, epoch), mixture, inputs, 3.0)
-        torch.testing.assert_close(found, expected)
+        before, mixture.weights.grad = made.programs, None
+        torch.testing.assert_close(found(calls(mixture, inputs, parameters, kind, epoch), mixture, 3.0), expected)
         return made.programs - before
 
     assert [call("a", 0) for _ in range(3)] == [0, 2, 0]  # values and gradients are a program each
@@ -126,24 +172,28 @@ def test_gradients_reach_a_parameter_that_took_anothers_place_in_memory(device):
     calls = RecordedCalls(recorder(device))
     inputs = mixture.inputs()
     for _ in range(3):
-        found = outcome(lambda *given: calls(mixture, given, [mixture.weights], "kind"), mixture, inputs, 1.0)
+        values = found(calls(mixture, inputs, [mixture.weights], "kind"), mixture, 1.0)
         former, mixture.weights = mixture.weights, torch.nn.Parameter(mixture.weights.data)
         assert former.data_ptr() == mixture.weights.data_ptr()
-    assert found[-1] is not None
-    torch.testing.assert_close(found, outcome(mixture, mixture, inputs, 1.0))
+    assert values[-1] is not None
+    torch.testing.assert_close(values, outcome(mixture, inputs, 1.0))
 
 
 def test_gradients_accumulate_as_without_recordings():
     mixture = Mixture("cpu")
     calls = RecordedCalls(run_again)
     inputs = mixture.inputs()
+
+    def call() -> Tensor:
+        slopes = [torch.ones(()), None, None]
+        calls(mixture, inputs, [mixture.weights], "kind").backpropagate(slopes)
+        assert mixture.weights.grad is not None
+        return mixture.weights.grad.clone()
+
     for _ in range(3):  # the third is a recording
         mixture.weights.grad = None
-        calls(mixture, inputs, [mixture.weights], "kind")[0].backward()
-    assert mixture.weights.grad is not None
-    once = mixture.weights.grad.clone()
-    calls(mixture, inputs, [mixture.weights], "kind")[0].backward()
-    torch.testing.assert_close(mixture.weights.grad, 2 * once)
+        once = call()
+    torch.testing.assert_close(call(), 2 * once)
 
 
 def test_where_nothing_can_be_recorded_calls_are_plain_and_say_so_once(caplog):
@@ -152,9 +202,10 @@ def test_where_nothing_can_be_recorded_calls_are_plain_and_say_so_once(caplog):
 
     mixture, calls = Mixture("cpu"), RecordedCalls(refuse)
     inputs = mixture.inputs()
+    expected = outcome(mixture, inputs, 1.0)
     for _ in range(4):
-        found = outcome(lambda *given: calls(mixture, given, [mixture.weights], "kind"), mixture, inputs, 1.0)
-        torch.testing.assert_close(found, outcome(mixture, mixture, inputs, 1.0))
+        mixture.weights.grad = None
+        torch.testing.assert_close(found(calls(mixture, inputs, [mixture.weights], "kind"), mixture, 1.0), expected)
     assert caplog.text.count("CUDA graphs cannot be used") == 1
     assert "many lines" not in caplog.text
 

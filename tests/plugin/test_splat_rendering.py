@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 
 import pytest
 import torch
+import torch.nn.functional as F
 from gsplat.cuda._torch_impl import _fully_fused_projection as projection
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci as quat_scale_to_covar_preci
 from gsplat.cuda._torch_impl import _spherical_harmonics as harmonics
@@ -16,10 +17,10 @@ from torch import Tensor
 
 from ssa_nerfstudio._system.cuda_graphs import RecordedCalls
 from ssa_nerfstudio.plugin import splat_rendering
-from ssa_nerfstudio.plugin.splat_rendering import PARAMETERS, SplatRenderer, activated, render_learned
+from ssa_nerfstudio.plugin.splat_rendering import PARAMETERS, LearnedRender, SplatRenderer, activated, render_learned
 from ssa_nerfstudio.rasterization import cuda
 from ssa_nerfstudio.rasterization import harmonics as shading
-from ssa_nerfstudio.rasterization.interface import Cameras, RenderOptions
+from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions
 
 WIDTH, HEIGHT = 96, 64
 
@@ -57,10 +58,11 @@ def outcome(renderer: Callable, given: Mapping[str, Tensor], view: int, sh_degre
         "absgrad": True,
         "rasterize_mode": mode,
     }
-    image, alpha, info = renderer(given, *cameras(view, device), WIDTH, HEIGHT, **options)
+    render = LearnedRender(*renderer(given, *cameras(view, device), WIDTH, HEIGHT, **options))
+    image, alpha, info = render[:3]
     info["means2d"].retain_grad()
     weights = torch.rand(image.shape, generator=torch.Generator().manual_seed(view)).to(device)
-    ((image * weights).sum() + alpha.square().sum()).backward()
+    render.backpropagate(weights, 2 * alpha.detach())
     visible = info["radii"] > 0
     found = {
         "image": image,
@@ -87,7 +89,8 @@ def test_a_training_view_is_gsplats_with_the_same_gradients(monkeypatch, sh_degr
     given = parameters(500, "cuda")
     renderer = SplatRenderer("auto")
     for view in range(8):
-        found = [outcome(render, given, view, sh_degree, mode)[0] for render in (by_gsplat, renderer)]
+        draw = renderer if graphs == "0" else renderer.learned
+        found = [outcome(render, given, view, sh_degree, mode)[0] for render in (by_gsplat, draw)]
         assert found[0].keys() == found[1].keys()
         for name, expected in found[0].items():
             difference = (found[1][name] - expected).norm() / expected.norm().clamp_min(1e-20)
@@ -130,8 +133,12 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
         for plain in (True, False):
             for value in given.values():
                 value.grad = None
-            image, alpha, info = render_learned(None if plain else calls, given, seen, options)
-            (image[0, 0, 0] * torch.tensor([1.0, 2.0, 3.0])).sum().add(alpha[0, 0, 0, 0]).backward()
+            render = render_learned(None if plain else calls, given, seen, options)
+            image, alpha, info = render[:3]
+            assert (render.projection is None) == plain
+            of_image, of_alpha = torch.zeros_like(image), torch.zeros_like(alpha)
+            of_image[0, 0, 0], of_alpha[0, 0, 0] = torch.tensor([1.0, 2.0, 3.0]), 1.0
+            render.backpropagate(of_image, of_alpha)
             gradients = {name: value.grad.clone() for name, value in given.items() if value.grad is not None}
             found.append({"image": image.detach().clone(), "radii": info["radii"].clone(), **gradients})
         torch.testing.assert_close(found[0], found[1])
@@ -139,6 +146,33 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
             given = {name: torch.nn.Parameter(value.data) for name, value in given.items()}
     assert [each is not None for each in calls._known.values()] == [True]
     assert len(found[0]) == (8 if sh_degree is not None else 7)
+
+
+def test_a_camera_that_is_learned_has_its_gradient(monkeypatch):
+    monkeypatch.setattr(cuda, "blend", sums)
+    monkeypatch.setattr(cuda, "project", lambda gaussians, cameras, options: moved(gaussians, cameras))
+    options = RenderOptions(0.01, 1e10, 0.0, 0.3, None, "RGB", absgrad=False, antialiased=False)
+    given, calls = parameters(30, "cpu"), RecordedCalls(run_again)
+    for _ in range(3):
+        found = []
+        for recorded in (None, calls):
+            for value in given.values():
+                value.grad = None
+            viewmats, Ks = cameras(1, "cpu")
+            correction = torch.zeros(3, requires_grad=True)
+            seen = Cameras(viewmats + F.pad(correction[None, :, None], (3, 0, 0, 1)), Ks, WIDTH, HEIGHT, None)
+            render = render_learned(recorded, given, seen, options)
+            render.backpropagate(torch.ones_like(render.image), None)
+            found.append(correction.grad)
+        assert found[0].abs().min() > 0
+        torch.testing.assert_close(*found)
+
+
+def moved(gaussians: Gaussians, cameras: Cameras) -> cuda.Projected:
+    """In place of a projection: all that depends on the camera is where it sees the means."""
+    seen = gaussians.means @ cameras.viewmats[0, :3, :3].T + cameras.viewmats[0, :3, 3]
+    radii = torch.ones(1, len(seen), dtype=torch.int32)
+    return cuda.Projected(seen[None, :, :2], seen[None].square(), gaussians.opacities[None], seen[None, :, 2], radii)
 
 
 def test_recordings_of_fewer_gaussians_are_given_up_once_there_are_too_many_to_record(monkeypatch):
@@ -152,14 +186,14 @@ def test_recordings_of_fewer_gaussians_are_given_up_once_there_are_too_many_to_r
 
     former = torch.nn.Parameter(torch.ones(3))
     for _ in range(2):
-        renderer.projections(double, [], [former], "kind")
+        renderer.projections(double, [], [former], "kind")  # a recording from the second call on
     kept, parameter = weakref.ref(double), weakref.ref(former)
     del double, former
-    outcome(renderer, parameters(50, "cpu"), 0, 3, "classic")
+    outcome(renderer.learned, parameters(50, "cpu"), 0, 3, "classic")
     gc.collect()
     assert kept() is not None  # as long as its recording
     assert parameter() is None
-    outcome(renderer, parameters(51, "cpu"), 0, 3, "classic")
+    outcome(renderer.learned, parameters(51, "cpu"), 0, 3, "classic")
     gc.collect()
     assert kept() is None
 

@@ -40,7 +40,7 @@ def set_up(tiny_scene, tmp_path_factory, configure_training):
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         model = trainer.pipeline.model
-        model._recorded = RecordedCalls(recorder(device))
+        model._recorded = RecordedCalls(recorder(device), of_sum=True)
         scales = model.gauss_params["scales"].data  # of a sphere, the gradient of its rotation is rounding alone
         scales += 0.5 * torch.randn(scales.shape, generator=torch.Generator().manual_seed(0)).to(scales.device)
         return trainer
@@ -73,6 +73,19 @@ def test_recorded_losses_train_the_same(set_up, monkeypatch, settings):
         assert not isinstance(value, torch.Tensor) or torch.equal(trained[1][name], value), name
 
 
+def test_a_scaled_loss_is_not_recorded(set_up, monkeypatch):
+    """A recording takes the gradient of the loss itself."""
+    record_losses(monkeypatch, True)
+    trainer = set_up("cpu", {})
+    assert trainer.pipeline.model.recordable
+    trainer.grad_scaler = torch.amp.GradScaler("cpu")
+    trainer.setup_optimizers()
+    model = trainer.pipeline.model
+    model.step_cb(trainer.optimizers, 1)
+    trainer.pipeline.train()
+    assert all(value.requires_grad for value in trainer.pipeline.get_train_loss_dict(1)[1].values())
+
+
 @SETTINGS
 @pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, settings):
@@ -91,7 +104,10 @@ def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, se
                 record_losses(monkeypatch, recorded)
             torch.manual_seed(step)  # of the background
             losses = model.get_loss_dict(model(camera), batch)
-            (2.0 * torch.stack(list(losses.values())).sum()).backward()  # as a gradient scaler's factor
+            loss = torch.stack(list(losses.values())).sum()
+            if loss.requires_grad:  # where they are recorded, only regularizers are left to differentiate
+                loss.backward()
+            assert loss.requires_grad == (not recorded or "strategy" in settings)
             found.append({f"loss {name}": value.detach().clone() for name, value in losses.items()})
             found[-1] |= {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
             monkeypatch.setattr(PhotoLosses, "_losses_are_recorded", possible)
