@@ -100,6 +100,10 @@ class SSAPipeline(VanillaPipeline):
             # After the photos are decoded: a size that they do not have is the dataset's fault.
             check_first_resolution(cameras, config.model.num_downscales)
 
+    def train(self, mode: bool = True) -> SSAPipeline:
+        """Set the mode of all modules; at once where they are in it, because upstream does so before every step."""
+        return self if self.training == self._model.training == mode else super().train(mode)
+
     def _examine_photos(self) -> None:
         """All that reads the training photos before the first step."""
         _tell_of_fisheyes(self.datamanager.train_dataset.raw_cameras)

@@ -149,6 +149,15 @@ def test_every_view_is_drawn_once_before_any_comes_again(trainer):
         assert sorted(drawn) == list(range(12))
 
 
+@pytest.mark.parametrize("of_model", [True, False])
+def test_all_modules_learn_again_after_a_look_at_the_scene(trainer, of_model):
+    """The viewer looks at the model, nerfstudio's evaluation at the pipeline."""
+    (trainer.pipeline.model if of_model else trainer.pipeline).eval()
+    assert not trainer.pipeline.model.artifacts.training
+    trainer.pipeline.train()
+    assert all(module.training for module in trainer.pipeline.modules())
+
+
 @pytest.mark.parametrize("steps", [3_000, 15_000, 60_000])
 def test_the_means_rate_follows_the_length(steps):
     config = copy.deepcopy(METHODS["ssa-splatfacto"])
