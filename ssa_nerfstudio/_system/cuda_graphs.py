@@ -309,4 +309,7 @@ def _copy(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
             pair[1].append(source)
     with torch.no_grad():
         for pair in by_type.values():
-            torch._foreach_copy_(*pair)  # pyright: ignore[reportPrivateImportUsage]
+            if len(pair[0]) == 1:  # a list takes the host twice as long
+                pair[0][0].copy_(pair[1][0])
+            else:
+                torch._foreach_copy_(*pair)  # pyright: ignore[reportPrivateImportUsage]

@@ -8,7 +8,7 @@ view to view. A refinement makes other Gaussians, and with them new recordings.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,6 +17,9 @@ from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, Evaluation, Rec
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
 from ssa_nerfstudio.rasterization.constants import EPS2D, FAR_PLANE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, info_of
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.rasterization.cuda import Blending
 
 PARAMETERS = ("means", "quats", "scales", "opacities", "features_dc", "features_rest")
 """Of the Gaussians, by the names that splatfacto gives them."""
@@ -31,18 +34,28 @@ class LearnedRender(NamedTuple):
     image: Tensor  # [1, H, W, 3], over nothing
     alpha: Tensor  # [1, H, W, 1]
     info: dict[str, Any]  # see `interface.make_rasterization`
-    views: tuple[Tensor, ...] = ()  # the projection's inputs
-    projection: Evaluation | None = None  # None: autograd knows of it
+    parts: RenderParts | None = None  # None: autograd knows of it
 
-    def backpropagate(self, of_image: Tensor | None, of_alpha: Tensor | None) -> None:
+    def backpropagate(self, of_image: Tensor, of_alpha: Tensor | None) -> None:
         """Add to the gradients of all that is learned, given those of the image and of alpha; once."""
-        found = [pair for pair in ((self.image, of_image), (self.alpha, of_alpha)) if pair[1] is not None]
-        torch.autograd.backward([value for value, _ in found], [slope for _, slope in found])
-        if self.projection is not None:
-            of_views = self.projection.backpropagate([value.grad for value in self.projection.values])
-            for view, gradient in zip(self.views, of_views, strict=True):
-                if gradient is not None:  # of a camera that is learned
-                    view.backward(gradient)
+        if self.parts is None:
+            found = [(self.image, of_image), (self.alpha, of_alpha)][: 1 if of_alpha is None else 2]
+            torch.autograd.backward([value for value, _ in found], [slope for _, slope in found])
+            return
+        views, projection, blending = self.parts
+        slopes = blending.backpropagate(of_image, torch.zeros_like(self.alpha) if of_alpha is None else of_alpha)
+        of_views = projection.backpropagate([*slopes[0], slopes[1]])
+        for view, gradient in zip(views, of_views, strict=True):
+            if gradient is not None:  # of a camera that is learned
+                view.backward(gradient)
+
+
+class RenderParts(NamedTuple):
+    """What a render is made of where its gradient is taken by hand."""
+
+    views: tuple[Tensor, ...]  # the projection's inputs
+    projection: Evaluation
+    blending: Blending
 
 
 class SplatRenderer:
@@ -70,7 +83,8 @@ class SplatRenderer:
         """
         device = parameters["means"].device
         if torch.is_grad_enabled() and options["render_mode"] == "RGB" and self._is_gsplat(device):
-            return render_learned(None, parameters, Cameras(viewmats, Ks, width, height, None), _settings(options))[:3]
+            cameras = Cameras(viewmats, Ks, width, height, None)
+            return render_learned(None, parameters, cameras, _settings(options))[:3]
         gaussians = activated(parameters, options["sh_degree"] is not None)
         draw = rasterizer(self._name, device)
         return draw(**gaussians._asdict(), viewmats=viewmats, Ks=Ks, width=width, height=height, **options)
@@ -90,9 +104,8 @@ class SplatRenderer:
             self.projections.forget()  # those of fewer, before the last refinement
         if count > MOST_RECORDED or not self._is_gsplat(device):
             return LearnedRender(*self(parameters, viewmats, Ks, width, height, **options))
-        return render_learned(
-            self.projections, parameters, Cameras(viewmats, Ks, width, height, None), _settings(options)
-        )
+        cameras = Cameras(viewmats, Ks, width, height, None)
+        return render_learned(self.projections, parameters, cameras, _settings(options))
 
     def _is_gsplat(self, device: torch.device) -> bool:
         return device.type == "cuda" and self._name in ("auto", "gsplat")
@@ -120,7 +133,8 @@ def render_learned(
     """Render for a training step with gsplat's kernels, and one of ours for the harmonics.
 
     Args:
-        calls: records the projection; None: its kernels are launched one by one, and autograd knows of them.
+        calls: records the projection; None: its kernels are launched one by one, and autograd takes the gradient. So
+            it is without Triton, whose kernel for the colors a recording needs.
         parameters: of N Gaussians, `PARAMETERS`.
         cameras: one, without a background.
         options: with `render_mode` RGB.
@@ -141,16 +155,19 @@ def render_learned(
         projected = cuda.project(gaussians, cameras._replace(viewmats=viewmats, Ks=Ks), options)
         # Depths sort, and are no part of the picture.
         projected = projected._replace(depths=projected.depths.detach())
-        return (*projected, *([colors_of(viewmats, projected.radii, values)] if with_colors else ()))
+        return *projected, colors_of(viewmats, projected.radii, values)
 
-    learned = [parameters[name] for name in PARAMETERS]
-    with_colors = degree is None or harmonics.runs_on_current_stream(learned[0].device, degree)
-    views, kind = (cameras.viewmats, cameras.Ks), (cameras.width, cameras.height, *vars(options).values())
+    learned, views = [parameters[name] for name in PARAMETERS], (cameras.viewmats, cameras.Ks)
+    if calls is None or not (degree is None or harmonics.runs_on_current_stream(learned[0].device, degree)):
+        *found, channels = compute(*views, *learned)
+        projected = cuda.Projected(*found)
+        image, alpha = cuda.blend(projected, channels, cameras, options)
+        return LearnedRender(image, alpha, info_of(projected.radii, projected.means2d, cameras.width, cameras.height))
+    kind = (cameras.width, cameras.height, *vars(options).values())
     # A training does not go back to a degree.
-    projection = calls(compute, views, learned, kind, epoch=degree) if calls else None
-    found = projection.values if projection else compute(*views, *learned)
-    projected = cuda.Projected(*found[: len(cuda.Projected._fields)])
-    channels = found[-1] if with_colors else colors_of(cameras.viewmats, projected.radii, learned)
-    image, alpha = cuda.blend(projected, channels, cameras, options)
+    projection = calls(compute, views, learned, kind, epoch=degree)
+    *found, channels = projection.values
+    projected = cuda.Projected(*found)
+    blending = cuda.Blending(projected, channels, cameras, options)
     info = info_of(projected.radii, projected.means2d, cameras.width, cameras.height)
-    return LearnedRender(image, alpha, info, views, projection)
+    return LearnedRender(blending.image, blending.alpha, info, RenderParts(views, projection, blending))

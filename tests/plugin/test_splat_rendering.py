@@ -112,10 +112,34 @@ def sums(projected: cuda.Projected, channels: Tensor, cameras, options) -> tuple
     return image.expand(1, HEIGHT, WIDTH, 3), alphas.sum().expand(1, HEIGHT, WIDTH, 1)
 
 
+class Summing:
+    """In place of `cuda.Blending`."""
+
+    def __init__(self, projected: cuda.Projected, channels: Tensor, cameras, options) -> None:
+        self._leaves = [each.detach().requires_grad_() for each in (*projected[:3], channels)]
+        *mine, colors = self._leaves
+        self._values = sums(cuda.Projected(*mine, *projected[3:]), colors, cameras, options)
+        self.image, self.alpha = (value.detach().requires_grad_() for value in self._values)
+
+    def backpropagate(self, of_image: Tensor, of_alpha: Tensor) -> tuple[cuda.Projected, Tensor]:
+        *found, of_colors = torch.autograd.grad(self._values, self._leaves, [of_image, of_alpha])
+        return cuda.Projected(*found, None, None), of_colors  # pyright: ignore[reportArgumentType]
+
+
+def recordable(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(cuda, "blend", sums)
+    patch.setattr(cuda, "Blending", Summing)
+    patch.setattr(shading, "runs_on_current_stream", lambda device, degree: True)
+
+
 @pytest.mark.parametrize("sh_degree", [3, None])
 def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degree):
     """On a CPU: gsplat's plain projection and harmonics, run again in place of a graph."""
-    monkeypatch.setattr(cuda, "blend", sums)
+    recordable(monkeypatch)
+
+    def shade(means: Tensor, center: Tensor, constant: Tensor, rest: Tensor, radii: Tensor, degree: int) -> Tensor:
+        colors = harmonics(degree, means - center, torch.cat([constant[:, None], rest], dim=1))
+        return torch.clamp_min(colors + 0.5, 0.0)
 
     def project(means: Tensor, _, quats: Tensor, scales: Tensor, *views, **options) -> tuple[Tensor | None, ...]:
         covariances, _ = quat_scale_to_covar_preci(quats, scales, compute_preci=False)
@@ -123,7 +147,7 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
         return projection(means, covariances, *views, eps2d=0.3)
 
     monkeypatch.setattr(cuda, "fully_fused_projection", project)
-    monkeypatch.setattr(shading, "spherical_harmonics", lambda *given, masks: harmonics(*given))
+    monkeypatch.setattr(shading, "shade", shade)
     options = RenderOptions(0.01, 1e10, 0.0, 0.3, sh_degree, "RGB", absgrad=False, antialiased=False)
     given = parameters(30, "cpu")
     calls = RecordedCalls(run_again)
@@ -135,7 +159,7 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
                 value.grad = None
             render = render_learned(None if plain else calls, given, seen, options)
             image, alpha, info = render[:3]
-            assert (render.projection is None) == plain
+            assert (render.parts is None) == plain
             of_image, of_alpha = torch.zeros_like(image), torch.zeros_like(alpha)
             of_image[0, 0, 0], of_alpha[0, 0, 0] = torch.tensor([1.0, 2.0, 3.0]), 1.0
             render.backpropagate(of_image, of_alpha)
@@ -149,7 +173,7 @@ def test_a_recording_takes_apart_what_is_shaded_and_blended(monkeypatch, sh_degr
 
 
 def test_a_camera_that_is_learned_has_its_gradient(monkeypatch):
-    monkeypatch.setattr(cuda, "blend", sums)
+    recordable(monkeypatch)
     monkeypatch.setattr(cuda, "project", lambda gaussians, cameras, options: moved(gaussians, cameras))
     options = RenderOptions(0.01, 1e10, 0.0, 0.3, None, "RGB", absgrad=False, antialiased=False)
     given, calls = parameters(30, "cpu"), RecordedCalls(run_again)

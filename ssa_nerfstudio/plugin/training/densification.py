@@ -17,6 +17,7 @@ from torch.nn import ParameterDict
 
 from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.training.gradient_statistics import GradientStatistics
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 from ssa_nerfstudio.plugin.training.nonfinite import mark_for_removal
 
@@ -75,10 +76,7 @@ class AdaptiveDensityControl(DefaultStrategy):
         super().step_post_backward(params, optimizers, state, step, info, packed)
 
     def _update_state(self, params: Any, state: dict[str, Any], info: dict[str, Any], packed: bool = False) -> None:
-        """Add to gsplat's sums, with zeros for invisible Gaussians instead of a compacted list of visible ones.
-
-        Compaction (`torch.where`) waits for the device at every training step.
-        """
+        """Add a step that was taken to gsplat's sums."""
         means2d: Tensor = info[self.key_for_gradient]
         gradients = means2d.absgrad if self.absgrad else means2d.grad  # pyright: ignore[reportAttributeAccessIssue]
         assert gradients is not None
@@ -87,17 +85,12 @@ class AdaptiveDensityControl(DefaultStrategy):
             state["count"] = gradients.new_zeros(gradients.shape[1])
         if self.refine_scale2d_stop_iter > 0 and state["radii"] is None:
             state["radii"] = gradients.new_zeros(gradients.shape[1])
-        width, height = info["width"], info["height"]
-        half = 0.5 * info["n_cameras"] * width
+        statistics = GradientStatistics(
+            state["grad2d"], state["count"], state["radii"] if self.refine_scale2d_stop_iter > 0 else None
+        )
+        size, taken = (info["width"], info["height"], info["n_cameras"]), info.get("taken")
         for gradient, radii in zip(gradients, info["radii"], strict=True):  # a camera's [N, 2], [N]
-            visible = radii > 0
-            # With respect to coordinates that run over [-1, 1] across the image.
-            norms = torch.hypot(gradient[:, 0], gradient[:, 1] * (height / width))
-            state["grad2d"].add_(torch.where(visible, norms, 0.0), alpha=half)
-            state["count"] += visible
-            if self.refine_scale2d_stop_iter > 0:
-                sizes = torch.where(visible, radii, 0) / float(max(width, height))
-                torch.maximum(state["radii"], sizes, out=state["radii"])
+            statistics.add(gradient, radii, *size, taken)
 
     @torch.no_grad()
     def _prune_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], state: dict[str, Any], step: int):
@@ -149,7 +142,7 @@ class MarkovChainMonteCarlo(MCMCStrategy):
             self._add_new_gs(params, optimizers, binoms)
             torch.cuda.empty_cache()
         lr = optimizers["means"].param_groups[0]["lr"]
-        perturb(params, lr * self.noise_lr, info.get("noise_scale"))
+        perturb(params, lr * self.noise_lr, info.get("taken"))
 
     @torch.no_grad()
     def _relocate_gs(self, params: Any, optimizers: dict[str, torch.optim.Optimizer], binoms: Tensor) -> int:

@@ -59,7 +59,8 @@ class NonFiniteGuard:
         self._max_skipped_steps = max_skipped_steps
         self._optimizers: Mapping[str, torch.optim.Optimizer] = {}
         self._loss: Tensor | None = None
-        self._verdicts: list[Verdict] = []
+        self._rows = torch.zeros(0, 2)
+        self._places: list[tuple[Tensor, Verdict]] = []
         self._factors: tuple[Tensor, ...] = ()
         self._judged = 0
         self._run_length, self._run_start = 0, 0
@@ -72,24 +73,28 @@ class NonFiniteGuard:
             optimizers: all of them by name, also those that only accumulate gradients at this step. No two gradients
                 may share memory.
         """
-        verdict = self.next_verdict(loss, optimizers)
+        _, verdict = self.next_place(loss, optimizers)
         assert self._loss is not None
         self.search(self._loss, verdict)
         return verdict
 
-    def next_verdict(self, loss: Tensor, optimizers: Mapping[str, torch.optim.Optimizer]) -> Verdict:
-        """Where the verdict on this step belongs, for the host to read it; `judge` without judging."""
+    def next_place(self, loss: Tensor, optimizers: Mapping[str, torch.optim.Optimizer]) -> tuple[Tensor, Verdict]:
+        """Where the verdict on this step belongs, for the host to read it, as a row [2] and as its two parts.
+
+        `judge` without judging.
+        """
         if self._judged == 0:
             # New storage, because what the previous window returned may still be in use on the device.
-            rows = loss.new_zeros(2, CHECK_EVERY, dtype=torch.float32, requires_grad=False)
+            self._rows = loss.new_zeros(CHECK_EVERY, 2, dtype=torch.float32, requires_grad=False)
+            columns = [column.unbind() for column in self._rows.unbind(dim=1)]
+            verdicts = [Verdict(*pair) for pair in zip(*columns, strict=True)]
+            self._places = [*zip(self._rows.unbind(), verdicts, strict=True)]
             if not self._factors or self._factors[0].device != loss.device:  # recorded steps know where they are
                 self._factors = loss.new_tensor([SQUARE_LIMIT, 1 / SQUARE_LIMIT], dtype=torch.float32).unbind()
-            self._taken, self._skipped = rows
-            self._verdicts = [Verdict(*pair) for pair in zip(*(row.unbind() for row in rows), strict=True)]
         self._optimizers, self._loss = optimizers, loss.detach().float()
-        verdict = self._verdicts[self._judged]
+        place = self._places[self._judged]
         self._judged += 1
-        return verdict
+        return place
 
     def search(self, loss: Tensor, verdict: Verdict) -> None:
         """Write a verdict whose `skipped` was 0, by a loss [] in float32 and the gradients of the last optimizers."""
@@ -103,14 +108,12 @@ class NonFiniteGuard:
         torch.logical_not(verdict.skipped, out=verdict.taken)
 
     def mask_densification(self, info: dict[str, Any]) -> None:
-        """Keep the step that was judged last out of the densification, if it was skipped.
+        """Tell the densification whether the step that was judged last is taken.
 
         Args:
-            info: the rasterizer's. A skipped step sets `radii` to 0 and adds `noise_scale` 0, else 1.
+            info: the rasterizer's; `taken` is added, 1, or 0 for a skipped step.
         """
-        taken = self._verdicts[self._judged - 1].taken
-        info["radii"] = info["radii"] * taken  # as float32: a cast would be one more launch
-        info["noise_scale"] = taken
+        info["taken"] = self._places[self._judged - 1][1].taken
 
     def check(self, step: int) -> int:
         """Read the verdicts since the last check; call it after `CHECK_EVERY` steps at most.
@@ -123,7 +126,7 @@ class NonFiniteGuard:
         """
         if not self._judged:
             return 0
-        skips = [bool(value) for value in self._skipped[: self._judged].tolist()]
+        skips = [bool(value) for value in self._rows[: self._judged, 1].tolist()]
         self._judged = 0
         if not any(skips):
             self._run_length = 0

@@ -72,9 +72,10 @@ class RecordedSteps:
         """
         if self._loss is None:
             self._loss = torch.zeros((), device=loss.device)
-            self._verdict = Verdict(*torch.zeros(2, device=loss.device).unbind())
+            self._judged = torch.zeros(2, device=loss.device)
+            self._verdict = Verdict(*self._judged.unbind())
         rates = [self._rate(optimizer, loss.device) for optimizer in optimizers]
-        place = None if guard is None else guard.next_verdict(loss, judged)
+        place = None if guard is None else guard.next_place(loss, judged)
         held, verdict = self._loss, self._verdict
 
         def step() -> None:
@@ -86,7 +87,7 @@ class RecordedSteps:
         self._loss.copy_(loss)
         self._changes(step, tuple(address for each in optimizers for address in (id(each), *each.addresses())))
         if place is not None:
-            torch._foreach_copy_(list(place), list(verdict))  # pyright: ignore[reportPrivateImportUsage]
+            place[0].copy_(self._judged)
 
     def _rate(self, optimizer: FusedAdam, device: torch.device) -> Tensor:
         """An optimizer's learning rate, on the device; written there where it has changed."""

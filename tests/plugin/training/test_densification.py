@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu, relocated
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
+from ssa_nerfstudio.plugin.training.gradient_statistics import GradientStatistics
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
 
 WIDTH, HEIGHT = 40, 30
@@ -67,6 +68,54 @@ def test_the_statistics_are_gsplats(absgrad):
             strategy._update_state(params, state, rendered(50, seed, absgrad))
     for key in ("grad2d", "count", "radii"):
         torch.testing.assert_close(states[0][key], states[1][key], rtol=1e-6, atol=0)
+
+
+STATISTICS = """
+import torch
+from ssa_nerfstudio.plugin.training import gradient_statistics as plain
+from ssa_nerfstudio.plugin.training._gradient_statistics_triton import add_view
+
+def views():
+    generator = torch.Generator().manual_seed(0)
+    for taken in (None, torch.tensor(1.0), torch.tensor(0.0), torch.tensor(1.0)):
+        scales = 10.0 ** torch.randint(-30, 3, (700, 1), generator=generator)
+        gradients = scales * torch.randn(700, 2, generator=generator)
+        radii = torch.randint(-20, 30, (700,), generator=generator, dtype=torch.int32).clamp_min(0)
+        gradients[0], radii[0] = 0.0, 7
+        if taken is not None and not taken:
+            gradients[5:9] = float("nan")
+        yield gradients, radii, taken
+
+for sizes in (True, False):
+    starts = [k * torch.rand(700, generator=torch.Generator().manual_seed(k)) for k in range(3)]
+    sums, mine = ([each.clone() for each in starts] for _ in "ab")
+    for gradients, radii, taken in views():
+        largest = (sums[2], mine[2]) if sizes else (None, None)
+        plain.GradientStatistics(*sums[:2], largest[0]).add(gradients, radii, 40, 30, 2, taken)
+        add_view(*mine[:2], largest[1], gradients, radii, taken, 40.0, 30 / 40, 1 / 40)
+    for name, a, b in zip(("gradients", "counts", "largest"), sums, mine, strict=True):
+        torch.testing.assert_close(b, a, rtol=1e-5, atol=0, msg=lambda text: f"{name}, sizes {sizes}: {text}")
+print("equal")
+"""
+
+
+def test_tritons_statistics_are_the_plain_ones_in_its_interpreter():
+    check_in_tritons_interpreter(STATISTICS)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("taken", [None, 0.0, 1.0])
+def test_statistics_on_a_gpu_are_those_of_a_cpu(taken):
+    generator = torch.Generator().manual_seed(0)
+    gradients = torch.randn(5000, 2, generator=generator) * 1e-6
+    radii = torch.randint(-20, 30, (5000,), generator=generator, dtype=torch.int32).clamp_min(0)
+    found = []
+    for device in ("cpu", "cuda"):
+        sums = [torch.full((5000,), 0.1, device=device) for _ in range(3)]
+        verdict = None if taken is None else torch.tensor(taken, device=device)
+        GradientStatistics(*sums).add(gradients.to(device), radii.to(device), WIDTH, HEIGHT, 1, verdict)
+        found.append([each.cpu() for each in sums])
+    torch.testing.assert_close(*found, rtol=1e-5, atol=0)
 
 
 def test_refinement_grows_and_prunes_as_gsplats_does():
@@ -276,7 +325,7 @@ def test_noise_is_left_out_of_a_skipped_step():
         params["opacities"].data[:] = -6.0
         before = params["means"].detach().clone()
         strategy = MarkovChainMonteCarlo(refine_start_iter=100)
-        info = {"noise_scale": torch.tensor(taken)}
+        info = {"taken": torch.tensor(taken)}
         strategy.step_post_backward(params, optimizers, strategy.initialize_state(), 1, info)
         moved.append((params["means"] - before).abs().max().item())
     assert moved[0] > 0

@@ -17,6 +17,7 @@ from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdam
+from ssa_nerfstudio.plugin.training.gradient_statistics import GradientStatistics
 from ssa_nerfstudio.plugin.training.nonfinite import (
     CLAMP_EVERY,
     SCALE_RANGE,
@@ -262,8 +263,13 @@ def test_a_skipped_step_is_masked_out_of_the_densification():
         guard.judge(LOSS, {"p": adam(parameter)})
         info = {"radii": torch.tensor([[3, 0, 7]], dtype=torch.int32)}
         guard.mask_densification(info)
-        assert info["radii"].tolist() == [[3 * taken, 0, 7 * taken]]
-        assert info["noise_scale"] == taken
+        assert info["taken"] == taken
+        statistics = GradientStatistics(torch.ones(3), torch.zeros(3), torch.zeros(3))
+        statistics.add(torch.full((3, 2), value), info["radii"][0], 10, 10, 1, info["taken"])
+        assert statistics.counts.tolist() == [taken, 0, taken]
+        assert (statistics.gradients > 1).tolist() == [taken == 1, False, taken == 1]
+        assert statistics.largest is not None
+        torch.testing.assert_close(statistics.largest, taken * torch.tensor([0.3, 0.0, 0.7]))
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="gsplat adds gradients up in any order")
