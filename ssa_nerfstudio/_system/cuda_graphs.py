@@ -165,7 +165,7 @@ class RecordedFunction:
         aliases = [each.detach().requires_grad_(each.requires_grad) for each in parameters]
         arguments = [*self._inputs, *aliases]
         leaves = [each for each in arguments if each.requires_grad]
-        one = torch.ones((), device=arguments[0].device)
+        self._one = torch.ones((), device=arguments[0].device)  # kept, because the recording reads it
         computed: list[Tensor] = []
         used: list[bool] = []
 
@@ -176,7 +176,7 @@ class RecordedFunction:
 
         def differentiate(again: bool = True) -> list[Tensor]:
             values = [each for each in computed if each.requires_grad]
-            slopes = [one] * len(values) if of_sum else self._slopes
+            slopes = [self._one] * len(values) if of_sum else self._slopes
             # The graph is kept where a record runs this program more than once.
             found = torch.autograd.grad(values, leaves, slopes, retain_graph=again, allow_unused=True)
             used[:] = [each is not None for each in found]
