@@ -36,15 +36,15 @@ class LearnedRender(NamedTuple):
     info: dict[str, Any]  # see `interface.make_rasterization`
     parts: RenderParts | None = None  # None: autograd knows of it
 
-    def backpropagate(self, of_image: Tensor, of_alpha: Tensor | None) -> None:
-        """Add to the gradients of all that is learned, given those of the image and of alpha; once."""
+    def backpropagate(self, of_image: Tensor | None, of_alpha: Tensor | None) -> None:
+        """Add to the gradients of all that is learned, given those of the image and of alpha (None: 0); once."""
+        picture = (self.image, of_image), (self.alpha, of_alpha)
+        slopes = [torch.zeros_like(value) if slope is None else slope for value, slope in picture]
         if self.parts is None:
-            found = [(self.image, of_image), (self.alpha, of_alpha)][: 1 if of_alpha is None else 2]
-            torch.autograd.backward([value for value, _ in found], [slope for _, slope in found])
+            torch.autograd.backward([self.image, self.alpha], slopes)
             return
         views, projection, blending = self.parts
-        slopes = blending.backpropagate(of_image, torch.zeros_like(self.alpha) if of_alpha is None else of_alpha)
-        of_views = projection.backpropagate([*slopes[0], slopes[1]])
+        of_views = projection.backpropagate(blending.backpropagate(*slopes))
         for view, gradient in zip(views, of_views, strict=True):
             if gradient is not None:  # of a camera that is learned
                 view.backward(gradient)

@@ -134,7 +134,7 @@ class Blending:
         splats = projected.means2d, projected.conics, channels, projected.alphas
         with torch.no_grad():
             lists = _tile_lists(projected, *size)
-            found = _RasterizeToPixels.forward(self, *splats, None, None, *size, TILE, *lists, absgrad)
+            found = _RasterizeToPixels.forward(self, *splats, *(None, None), *size, TILE, *lists, absgrad)  # pyright: ignore
         self.image, self.alpha = (each.requires_grad_() for each in found)
 
     def save_for_backward(self, *tensors: Tensor | None) -> None:
@@ -142,11 +142,15 @@ class Blending:
         self.saved_tensors = tensors
 
     @torch.no_grad()
-    def backpropagate(self, of_image: Tensor, of_alpha: Tensor) -> tuple[Projected, Tensor]:
-        """Gradients of what was blended, given those of the picture; sets `grad` and `absgrad` of the centers."""
+    def backpropagate(self, of_image: Tensor, of_alpha: Tensor) -> list[Tensor | None]:
+        """Gradients of what was blended, given those of the picture; sets `grad` and `absgrad` of the centers.
+
+        Returns:
+            In the order of `Projected`, None for depths and radii, and of the channels.
+        """
         means2d, conics, channels, alphas, *_ = _RasterizeToPixels.backward(self, of_image, of_alpha)
         self._centers.grad = means2d
-        return Projected(means2d, conics, alphas, None, None), channels
+        return [means2d, conics, alphas, None, None, channels]
 
 
 def render(gaussians: Gaussians, cameras: Cameras, options: RenderOptions) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -124,7 +124,7 @@ def _tree(database: Path, model: pycolmap.Reconstruction) -> list[_Link]:
     # Fewest are the least: a minimum spanning tree of the inverse numbers.
     costs = [1 / len(link.matches) for link in between.values()]
     tree = minimum_spanning_tree(coo_array((costs, ends.T), shape=(len(frames), len(frames)))).tocoo()
-    return [between[frames[i], frames[j]] for i, j in zip(tree.row, tree.col, strict=True)]
+    return [between[int(frames[i]), int(frames[j])] for i, j in zip(tree.row, tree.col, strict=True)]
 
 
 def _points(model: pycolmap.Reconstruction) -> dict[int, np.ndarray]:

@@ -117,13 +117,14 @@ class Summing:
 
     def __init__(self, projected: cuda.Projected, channels: Tensor, cameras, options) -> None:
         self._leaves = [each.detach().requires_grad_() for each in (*projected[:3], channels)]
-        *mine, colors = self._leaves
-        self._values = sums(cuda.Projected(*mine, *projected[3:]), colors, cameras, options)
+        means2d, conics, alphas, colors = self._leaves
+        mine = projected._replace(means2d=means2d, conics=conics, alphas=alphas)
+        self._values = sums(mine, colors, cameras, options)
         self.image, self.alpha = (value.detach().requires_grad_() for value in self._values)
 
-    def backpropagate(self, of_image: Tensor, of_alpha: Tensor) -> tuple[cuda.Projected, Tensor]:
+    def backpropagate(self, of_image: Tensor, of_alpha: Tensor) -> list[Tensor | None]:
         *found, of_colors = torch.autograd.grad(self._values, self._leaves, [of_image, of_alpha])
-        return cuda.Projected(*found, None, None), of_colors  # pyright: ignore[reportArgumentType]
+        return [*found, None, None, of_colors]
 
 
 def recordable(patch: pytest.MonkeyPatch) -> None:
