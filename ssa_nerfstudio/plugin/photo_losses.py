@@ -68,8 +68,7 @@ class PhotoLosses(SplatfactoModel):
     def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
         """`_photo_losses` of a view of which only the splats were drawn, as one CUDA graph; draws the rest, too.
 
-        What is learned has its gradient afterwards, and the losses have no history: autograd knows of the blending
-        alone.
+        What is learned has its gradient from these losses afterwards, and they have no history.
         """
         render: LearnedRender = drawn.pop("render")
         photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}

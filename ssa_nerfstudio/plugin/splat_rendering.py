@@ -1,8 +1,8 @@
 """From splatfacto's parameters to a render.
 
-On CUDA, the projection is one CUDA graph while training: the activations of the parameters, the projection and the
-colors. Sorting and blending are launched one by one, because the number of tiles that the Gaussians cover differs from
-view to view. A refinement makes other Gaussians, and with them new recordings.
+On CUDA, the projection is one CUDA graph in training steps whose losses are one, too: the activations of the
+parameters, the projection and the colors. Sorting and blending are launched one by one, because the number of tiles
+that the Gaussians cover differs from view to view. A refinement makes other Gaussians, and with them new recordings.
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, Evaluation, RecordedCalls
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable
+from ssa_nerfstudio._system.gradients_by_hand import Evaluation
 from ssa_nerfstudio.rasterization import RasterizerName, rasterizer
 from ssa_nerfstudio.rasterization.constants import EPS2D, FAR_PLANE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, info_of
@@ -102,7 +103,7 @@ class SplatRenderer:
         count, device = len(parameters["means"]), parameters["means"].device
         if count > MOST_RECORDED:
             self.projections.forget()  # those of fewer, before the last refinement
-        if count > MOST_RECORDED or not self._is_gsplat(device):
+        if count > MOST_RECORDED or not self._is_gsplat(device) or not graphs_are_usable():
             return LearnedRender(*self(parameters, viewmats, Ks, width, height, **options))
         cameras = Cameras(viewmats, Ks, width, height, None)
         return render_learned(self.projections, parameters, cameras, _settings(options))

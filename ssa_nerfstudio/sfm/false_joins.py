@@ -107,7 +107,7 @@ def _frames(link: _Link, model: pycolmap.Reconstruction) -> tuple[int, int]:
 
 
 def _tree(database: Path, model: pycolmap.Reconstruction) -> list[_Link]:
-    """The strongest links that connect all photos that have poses, a rig's photos of one moment being one."""
+    """The strongest links that connect all photos that have poses, a rig's photos of one moment being one, in order."""
     with pycolmap.Database.open(database) as opened:
         ids, geometries = opened.read_two_view_geometries()
     links = [
@@ -124,7 +124,8 @@ def _tree(database: Path, model: pycolmap.Reconstruction) -> list[_Link]:
     # Fewest are the least: a minimum spanning tree of the inverse numbers.
     costs = [1 / len(link.matches) for link in between.values()]
     tree = minimum_spanning_tree(coo_array((costs, ends.T), shape=(len(frames), len(frames)))).tocoo()
-    return [between[int(frames[i]), int(frames[j])] for i, j in zip(tree.row, tree.col, strict=True)]
+    links = [between[int(frames[i]), int(frames[j])] for i, j in zip(tree.row, tree.col, strict=True)]
+    return sorted(links, key=lambda link: len(link.matches), reverse=True)
 
 
 def _points(model: pycolmap.Reconstruction) -> dict[int, np.ndarray]:

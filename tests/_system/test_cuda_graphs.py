@@ -7,7 +7,8 @@ import torch
 from recordings import CUDA, recorder, run_again
 from torch import Tensor
 
-from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, Evaluation, RecordedCalls, RecordedFunction, evaluate
+from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, RecordedFunction
+from ssa_nerfstudio._system.gradients_by_hand import Evaluation, evaluate
 
 
 class Mixture:
@@ -179,21 +180,35 @@ def test_gradients_reach_a_parameter_that_took_anothers_place_in_memory(device):
     torch.testing.assert_close(values, outcome(mixture, inputs, 1.0))
 
 
-def test_gradients_accumulate_as_without_recordings():
+@pytest.mark.parametrize("through_calls", [True, False])
+def test_gradients_accumulate_as_without_recordings(through_calls):
+    """A recording would write over the gradient of its last call."""
     mixture = Mixture("cpu")
+    parameters, slopes = [mixture.weights], [torch.ones(()), None, None]
     calls = RecordedCalls(run_again)
-    inputs = mixture.inputs()
+    other = RecordedFunction(mixture, mixture.inputs(), parameters, run_again(), of_sum=False)
 
-    def call() -> Tensor:
-        slopes = [torch.ones(()), None, None]
-        calls(mixture, inputs, [mixture.weights], "kind").backpropagate(slopes)
+    def gradient(inputs: list[Tensor], accumulate: bool, plain: bool) -> Tensor:
+        if not accumulate:
+            mixture.weights.grad = None
+        if plain:
+            evaluation = evaluate(mixture, inputs, parameters, False)
+        else:
+            evaluation = calls(mixture, inputs, parameters, "kind")
+        evaluation.backpropagate(slopes)
         assert mixture.weights.grad is not None
         return mixture.weights.grad.clone()
 
-    for _ in range(3):  # the third is a recording
-        mixture.weights.grad = None
-        once = call()
-    torch.testing.assert_close(call(), 2 * once)
+    views = [mixture.inputs() for _ in range(4)]
+    expected = sum(gradient(inputs, accumulate=False, plain=True) for inputs in views[2:])
+    for inputs in views[:3]:  # the third is a recording
+        gradient(inputs, accumulate=False, plain=False)
+    if through_calls:
+        found = gradient(views[3], accumulate=True, plain=False)
+    else:  # of two recordings, whose gradients are in two places
+        other(views[3], parameters).backpropagate(slopes)
+        found = mixture.weights.grad
+    torch.testing.assert_close(found, expected)
 
 
 def test_where_nothing_can_be_recorded_calls_are_plain_and_say_so_once(caplog):

@@ -42,6 +42,7 @@ class RecordedSteps:
     def __init__(self) -> None:
         self._changes = RecordedChanges()
         self._loss: Tensor | None = None
+        self._row = torch.zeros(2)
         self._rates: dict[FusedAdam, tuple[Tensor, float]] = {}
 
     @staticmethod
@@ -72,8 +73,8 @@ class RecordedSteps:
         """
         if self._loss is None:
             self._loss = torch.zeros((), device=loss.device)
-            self._judged = torch.zeros(2, device=loss.device)
-            self._verdict = Verdict(*self._judged.unbind())
+            self._row = torch.zeros(2, device=loss.device)
+            self._verdict = Verdict(*self._row.unbind())
         rates = [self._rate(optimizer, loss.device) for optimizer in optimizers]
         place = None if guard is None else guard.next_place(loss, judged)
         held, verdict = self._loss, self._verdict
@@ -87,7 +88,7 @@ class RecordedSteps:
         self._loss.copy_(loss)
         self._changes(step, tuple(address for each in optimizers for address in (id(each), *each.addresses())))
         if place is not None:
-            place[0].copy_(self._judged)
+            place[0].copy_(self._row)
 
     def _rate(self, optimizer: FusedAdam, device: torch.device) -> Tensor:
         """An optimizer's learning rate, on the device; written there where it has changed."""
