@@ -137,7 +137,7 @@ class RecordedFunction:
             self._slopes = [torch.zeros_like(each) for each in computed if each.requires_grad]
             gradients, self._rederive = record(differentiate)
         self._of_sum = of_sum
-        self._smooth = [each.requires_grad for each in computed]
+        self._smooth = [each.requires_grad and not of_sum for each in computed]
         each_found = iter(gradients)
         of_leaves = iter([next(each_found) if each else None for each in used])
         found_of = [next(of_leaves) if each.requires_grad else None for each in arguments]
@@ -154,10 +154,7 @@ class RecordedFunction:
         self._recompute()
         self._calls += 1
         call = self._calls
-        if self._of_sum:
-            values = [each.detach() for each in self._values]
-        else:
-            values = [each.detach().requires_grad_(smooth) for each, smooth in zip(self._values, self._smooth)]  # noqa: B905
+        values = [each.detach().requires_grad_(smooth) for each, smooth in zip(self._values, self._smooth)]  # noqa: B905
 
         def differentiate(slopes: Sequence[Tensor | None]) -> Gradients:
             if call != self._calls:
