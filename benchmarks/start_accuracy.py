@@ -148,7 +148,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         started = time.monotonic()
         with _scaled(constant, factor):
             detection = detect(statistics) if constant.split(".")[0] in DETECTION else plain
-            found = estimate(sample_points(points, views), guide, detection.opaque, detection.mask)
+            found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
             overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
             initialize_from(overlay, found, guide, detection.mask)
         error = torch.cat(overlay.layers(), dim=-1).detach() - truth

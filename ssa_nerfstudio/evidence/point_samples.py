@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence import brightness
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 WORKING_SIZE = brightness.WORKING_SIZE // 2
 """Photos are reduced by the integer that brings their longer side nearest to this, pixels: half of detection's."""
@@ -48,7 +49,7 @@ class PointSamples:
     pixel: Tensor
     """[S] int64: working pixel, row by row."""
     color: Tensor
-    """[S, 3] in [0, 1], brighter only by a view's gain: the photo there."""
+    """[S, 3], at least 0, about 1 at most but for a view's gain: what the photo shows of the point."""
     points: int
     """Number of points."""
     size: tuple[int, int]
@@ -69,12 +70,19 @@ def working_reduction(height: int, width: int) -> int:
     return max(1, min(round(max(height, width) / WORKING_SIZE), height, width))
 
 
-def sample_points(points: Tensor, views: Sequence[View]) -> PointSamples:
+def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = None) -> PointSamples:
     """Project points into every view, drop those that nearer ones hide, and read the photo there.
+
+    A photo is read where the point is, through a box as large as a working pixel. Read in the working pixel around it,
+    up to half of that from the point, it would show something else of the scene. But layers are those of the pixel,
+    and where the artifact has an edge, the box around the point has others. So a sample is brought to its pixel by
+    the mean M and the deviation D of the photos, which the artifact changes to T M + B and T D: of a color I at the
+    point, it is M + (I - M') D / D' with M', D' at the point.
 
     Args:
         points: [N, 3], world units; those that are not finite are left out.
         views: of one size, at least one.
+        guide: M and D of the photos, [H, W, 4]; None: samples are left as they are read.
 
     Returns:
         The samples, on the points' device.
@@ -83,16 +91,27 @@ def sample_points(points: Tensor, views: Sequence[View]) -> PointSamples:
     height, width = views[0].image.shape[:2]
     reduction = working_reduction(height, width)
     size = height // reduction, width // reduction
+    if guide is not None:
+        guide = guide.to(points.device).float()
+        of_pixels = reduced(guide, reduction).reshape(-1, 4)
     found = []
     for number, view in enumerate(views):
-        image = _reduced(view.image[..., :3], reduction, points.device)
-        image = image if view.gain is None else image / view.gain.to(image)
-        index, place = _visible(points, view, reduction, size)
+        image = view.image[..., :3].to(points.device)
+        index, place, position = _visible(points, view, reduction, size)
         if view.mask is not None:
-            seen = _reduced(view.mask.reshape(height, width, 1) != 0, reduction, points.device)[..., 0] == 1
-            kept = seen.flatten()[place]
-            index, place = index[kept], place[kept]
-        found.append((index, place, image.reshape(-1, 3)[place], torch.full_like(index, number)))
+            mask = (view.mask.reshape(height, width, 1) != 0).to(points.device).float()
+            seen = reduced(mask, reduction).flatten()[place] == 1
+            seen &= _box_means(mask, position, reduction)[:, 0] > 1 - GRAY_LEVEL
+            index, place, position = index[seen], place[seen], position[seen]
+        color = _box_means(image, position, reduction) / {torch.uint8: 255.0, torch.uint16: 65535.0}.get(image.dtype, 1)
+        color = color if view.gain is None else color / view.gain.to(color)
+        if guide is not None:
+            mean, deviation = of_pixels[place].split((3, 1), dim=-1)
+            mean_there, deviation_there = _box_means(guide, position, reduction).split((3, 1), dim=-1)
+            # A gray level, because photos are rounded.
+            ratio = (deviation + GRAY_LEVEL) / (deviation_there + GRAY_LEVEL)
+            color = (mean + (color - mean_there) * ratio).clamp_min(0)
+        found.append((index, place, color, torch.full_like(index, number)))
     point, pixel, color, shown_by = (torch.cat(parts) for parts in zip(*found, strict=True))
     return PointSamples(point, pixel, color, len(points), size, shown_by).ordered()
 
@@ -130,14 +149,26 @@ def project(
     return index, position[index], depth[index]
 
 
-def _reduced(image: Tensor, reduction: int, device: torch.device) -> Tensor:
-    """At the working size [h, w, C], float32 in [0, 1]."""
-    full = {torch.uint8: 255.0, torch.uint16: 65535.0}.get(image.dtype, 1.0)
-    return reduced(image.to(device).float(), reduction) / full
+def _box_means(image: Tensor, center: Tensor, side: int) -> Tensor:
+    """Means [M, C] of an image [H, W, C] over boxes of this side around x, y [M, 2], which are moved into the frame.
+
+    Between pixels by bilinear interpolation, in the image's own units.
+    """
+    height, width = image.shape[:2]
+    most = center.new_tensor([width - side, height - side])
+    corner = torch.minimum((center - side / 2).clamp_min(0), most)
+    first = corner.floor()
+    # The first pixel of a row counts by its part in the box, and so does the one after the last whole one.
+    weights = torch.ones(*center.shape, side + 1, device=center.device)
+    weights[..., -1] = corner - first
+    weights[..., 0] -= weights[..., -1]
+    x, y = (first.long()[..., None] + torch.arange(side + 1, device=center.device)).unbind(dim=1)
+    values = image[y.clamp_max(height - 1)[:, :, None], x.clamp_max(width - 1)[:, None, :]].float()
+    return torch.einsum("mijc,mj,mi->mc", values, *weights.unbind(dim=1)) / side**2
 
 
-def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) -> tuple[Tensor, Tensor]:
-    """Indices of the points that the view sees, and their working pixels."""
+def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Indices of the points that the view sees, their working pixels, and their positions in the photo."""
     height, width = size
     index, position, depth = project(
         points, view.world_to_camera, view.intrinsics, height * reduction, width * reduction
@@ -149,4 +180,4 @@ def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) 
     side = 2 * OCCLUSION_RADIUS + 1
     nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
     seen = depth <= nearest.flatten()[pixel] * (1 + OCCLUSION_TOLERANCE)
-    return index[seen], pixel[seen]
+    return index[seen], pixel[seen], position[seen]

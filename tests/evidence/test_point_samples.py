@@ -7,7 +7,9 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.evidence import point_samples
+from ssa_nerfstudio.evidence.initialization import guide_of
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
+from ssa_nerfstudio.evidence.statistics import accumulate
 
 K = torch.tensor([[40.0, 0.0, 30.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]])
 
@@ -28,17 +30,19 @@ def coordinates(dtype: torch.dtype = torch.uint8) -> Tensor:
 
 @pytest.mark.parametrize("dtype", [torch.uint8, torch.uint16, torch.float32])
 def test_a_sample_is_the_photo_where_the_point_projects(dtype: torch.dtype) -> None:
-    points = torch.tensor([[0.0, 0.0, 2.0], [0.5, -0.25, 2.0], [0.0, 0.0, -2.0], [9.0, 0.0, 2.0]])
+    points = torch.tensor([[0.0125, 0.04, 2.0], [0.5, -0.25, 2.0], [0.0, 0.0, -2.0], [9.0, 0.0, 2.0]])
     samples = sample_points(points, [view(coordinates(dtype)), view(coordinates(dtype), x=0.5)])
     assert samples.size == (40, 60)
     assert samples.points == 4
-    found = sorted(zip(samples.point.tolist(), samples.pixel.tolist(), strict=True))
     # x = 40 X / Z + 30, y = 40 Y / Z + 20; the second camera is 0.5 to the right: 10 pixels.
-    assert found == [(0, 20 * 60 + 20), (0, 20 * 60 + 30), (1, 15 * 60 + 30), (1, 15 * 60 + 40)]
+    place = torch.tensor([[20.25, 20.8], [30.25, 20.8], [30.0, 15.0], [40.0, 15.0]])
+    order = torch.argsort(samples.point * 10_000 + samples.pixel)
+    assert samples.point[order].tolist() == [0, 0, 1, 1]
+    assert samples.pixel[order].tolist() == [20 * 60 + 20, 20 * 60 + 30, 15 * 60 + 30, 15 * 60 + 40]
     scale = 65535 / 256 if dtype == torch.uint16 else 255
-    rows, columns = samples.pixel // 60, samples.pixel % 60
-    torch.testing.assert_close(samples.color[:, 0] * scale, rows.float(), atol=0.01, rtol=0)
-    torch.testing.assert_close(samples.color[:, 1] * scale, columns.float(), atol=0.01, rtol=0)
+    # Pixels have their centers at one half.
+    torch.testing.assert_close(samples.color[order, 0] * scale, place[:, 1] - 0.5, atol=0.01, rtol=0)
+    torch.testing.assert_close(samples.color[order, 1] * scale, place[:, 0] - 0.5, atol=0.01, rtol=0)
     assert samples.point.tolist() == sorted(samples.point.tolist())
 
 
@@ -54,6 +58,39 @@ def test_masked_pixels_and_points_that_are_not_finite_are_left_out() -> None:
     mask[:, :35] = False
     samples = sample_points(points, [view(coordinates(), mask=mask)])
     assert samples.pixel.tolist() == [20 * 60 + 40]
+
+
+@pytest.mark.parametrize("dtype", [torch.uint8, torch.float32])
+def test_a_sample_shows_the_layers_of_its_pixel_on_either_side_of_an_edge(dtype: torch.dtype) -> None:
+    """The artifact ends in the middle of the frame, between two working pixels; what is behind has one color a view."""
+    clear, opaque = torch.tensor([1.0, 0.0]), torch.tensor([0.3, 0.5])
+    layers = torch.where(torch.arange(960)[None, :, None] < 480, opaque, clear).expand(540, 960, 2)
+    brightness = torch.linspace(0.2, 0.9, 7)
+    images = [(layers[..., :1] * each + layers[..., 1:]).expand(-1, -1, 3) for each in brightness]
+    images = [image if dtype == torch.float32 else (255 * image).round().to(dtype) for image in images]
+    intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
+    views = [View(image, None, torch.eye(4), intrinsics) for image in images]
+    points = torch.stack(torch.meshgrid(torch.linspace(-0.03, 0.03, 40), torch.tensor([0.0, 0.3]), indexing="ij"), -1)
+    points = torch.cat([points.reshape(-1, 2), torch.full((80, 1), 2.0)], dim=-1)
+    samples = sample_points(points, views, guide_of(accumulate((image, None) for image in images)))
+    of_pixel = torch.where(samples.pixel[:, None] % 240 < 120, opaque, clear)
+    expected = of_pixel[:, 0] * brightness[samples.view] + of_pixel[:, 1]
+    assert {0.3, 1.0} == {round(float(each), 3) for each in of_pixel[:, 0]}
+    torch.testing.assert_close(samples.color, expected[:, None].expand(-1, 3), atol=0.01, rtol=0)
+    between = sample_points(points, views)
+    assert ((between.color - expected[:, None]).abs() > 0.05).any(), "without the photos' mean and deviation"
+
+
+def test_a_box_that_a_mask_touches_is_left_out() -> None:
+    mask = torch.ones(540, 960, dtype=torch.bool)
+    mask[:, :478] = False  # the working pixel from 480 to 483 is seen
+    intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
+    points = torch.tensor([[-0.001, 0.0, 0.6], [0.0015, 0.0, 0.6], [0.0005, 0.1, 0.6]])  # at 479, 481.5 and 480.5
+    samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
+    assert samples.point.tolist() == [1, 2]
+    mask[:, :480] = False
+    samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
+    assert samples.point.tolist() == [], "the box around 481.5 begins at 479.5"
 
 
 def test_large_photos_are_reduced_and_many_points_thinned(monkeypatch) -> None:

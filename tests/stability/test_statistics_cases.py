@@ -225,7 +225,7 @@ def estimated(points: Tensor, images: np.ndarray, masks: list | None = None) -> 
     views = [View(on_device(image), mask, torch.eye(4), K) for image, mask in zip(images, torn, strict=True)]
     statistics = stream(images, masks)
     nowhere = torch.zeros(statistics.size, dtype=torch.bool)
-    found = estimate(sample_points(points, views), guide_of(statistics), nowhere, nowhere)
+    found = estimate(sample_points(points, views, guide_of(statistics)), guide_of(statistics), nowhere, nowhere)
     for layer in (found.transmittance, found.addition):
         assert torch.isfinite(layer).all()
         assert 0 <= layer.min() <= layer.max() <= 1
