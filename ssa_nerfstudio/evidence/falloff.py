@@ -83,7 +83,9 @@ def _modes(height: int, width: int) -> Tensor:
 
 def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
     """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, with Cauchy's weights."""
-    brightness, every = samples.color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
+    # Of patches, because a point's own color changes with its distance.
+    color = samples.color if samples.patch is None else samples.patch
+    brightness, every = color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
     usable = (brightness < USABLE[1]) & (samples.view % every == 0)
     usable &= samples.point % (int(usable.sum()) // MAX_SAMPLES + 1) == 0
     if not usable.any():

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence import brightness
-from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 WORKING_SIZE = brightness.WORKING_SIZE // 2
@@ -56,13 +55,33 @@ class PointSamples:
     """Height and width of the working frame."""
     view: Tensor
     """[S] int64: index of the view."""
+    patch: Tensor | None = None
+    """[S, 3]: mean color around the point, over the same patch of the scene in every view; None: as `color`."""
 
     def ordered(self) -> PointSamples:
         """Sorted by point, then by brightness."""
         order = torch.argsort(self.color.sum(dim=-1))
         order = order[torch.argsort(self.point[order], stable=True)]
         point, pixel, color, view = (each[order] for each in (self.point, self.pixel, self.color, self.view))
-        return PointSamples(point, pixel, color, self.points, self.size, view)
+        patch = None if self.patch is None else self.patch[order]
+        return PointSamples(point, pixel, color, self.points, self.size, view, patch)
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """The M points that a view sees."""
+
+    index: Tensor
+    """[M] int64."""
+    pixel: Tensor
+    """[M] int64: working pixel, row by row."""
+    position: Tensor
+    """[M, 2]: x and y in the photo."""
+    depth: Tensor
+    """[M]."""
+
+    def __getitem__(self, kept: Tensor) -> _Sight:
+        return _Sight(self.index[kept], self.pixel[kept], self.position[kept], self.depth[kept])
 
 
 def working_reduction(height: int, width: int) -> int:
@@ -79,6 +98,10 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     the mean M and the deviation D of the photos, which the artifact changes to T M + B and T D: of a color I at the
     point, it is M + (I - M') D / D' with M', D' at the point.
 
+    A box shows the less of the scene the nearer it is. So the color of a point changes with its distance, and on a walk
+    with its place in the frame. Patches are as wide as the window of occlusions where the point is farthest, and the
+    wider the nearer it is.
+
     Args:
         points: [N, 3], world units; those that are not finite are left out.
         views: of one size, at least one.
@@ -92,28 +115,37 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     reduction = working_reduction(height, width)
     size = height // reduction, width // reduction
     if guide is not None:
-        guide = guide.to(points.device).float()
-        of_pixels = reduced(guide, reduction).reshape(-1, 4)
+        guide = _boxes(guide.to(points.device), reduction)
+        of_pixels = guide[::reduction, ::reduction].reshape(-1, 4)
+    sights = [_visible(points, view, reduction, size) for view in views]
+    depth, seen = torch.cat([sight.depth for sight in sights]), torch.cat([sight.index for sight in sights])
+    farthest = depth.new_zeros(len(points)).scatter_reduce(0, seen, depth, "amax")
     found = []
-    for number, view in enumerate(views):
-        image = view.image[..., :3].to(points.device)
-        index, place, position = _visible(points, view, reduction, size)
+    for number, (view, sight) in enumerate(zip(views, sights, strict=True)):
+        image, mask = view.image[..., :3].to(points.device), None
         if view.mask is not None:
-            mask = (view.mask.reshape(height, width, 1) != 0).to(points.device).float()
-            seen = reduced(mask, reduction).flatten()[place] == 1
-            seen &= _box_means(mask, position, reduction)[:, 0] > 1 - GRAY_LEVEL
-            index, place, position = index[seen], place[seen], position[seen]
-        color = _box_means(image, position, reduction) / {torch.uint8: 255.0, torch.uint16: 65535.0}.get(image.dtype, 1)
-        color = color if view.gain is None else color / view.gain.to(color)
+            mask = (view.mask.reshape(height, width, 1) != 0).to(image)
+            unmasked = _boxes(mask, reduction)
+            inside = unmasked[::reduction, ::reduction].flatten()[sight.pixel] == 1
+            sight = sight[inside & (_read(unmasked, sight.position, reduction)[:, 0] > 1 - GRAY_LEVEL)]
+        white = points.new_full((3,), {torch.uint8: 255, torch.uint16: 65535}.get(image.dtype, 1))
+        white = white if view.gain is None else white * view.gain.to(white)
+        boxes = _boxes(image, reduction)
+        color = _read(boxes, sight.position, reduction) / white
         if guide is not None:
-            mean, deviation = of_pixels[place].split((3, 1), dim=-1)
-            mean_there, deviation_there = _box_means(guide, position, reduction).split((3, 1), dim=-1)
+            mean, deviation = of_pixels[sight.pixel].split((3, 1), dim=-1)
+            mean_there, deviation_there = _read(guide, sight.position, reduction).split((3, 1), dim=-1)
             # A gray level, because photos are rounded.
             ratio = (deviation + GRAY_LEVEL) / (deviation_there + GRAY_LEVEL)
             color = (mean + (color - mean_there) * ratio).clamp_min(0)
-        found.append((index, place, color, torch.full_like(index, number)))
-    point, pixel, color, shown_by = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return PointSamples(point, pixel, color, len(points), size, shown_by).ordered()
+        if mask is not None:
+            boxes = torch.cat([_boxes(image * mask, reduction), unmasked], dim=-1)
+        side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
+        patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
+        patch = patch / white if mask is None else patch[:, :3] / patch[:, 3:] / white
+        found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), patch))
+    point, pixel, color, shown_by, patch = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return PointSamples(point, pixel, color, len(points), size, shown_by, patch).ordered()
 
 
 def regular_subset(points: Tensor, views: int) -> Tensor:
@@ -149,26 +181,48 @@ def project(
     return index, position[index], depth[index]
 
 
-def _box_means(image: Tensor, center: Tensor, side: int) -> Tensor:
-    """Means [M, C] of an image [H, W, C] over boxes of this side around x, y [M, 2], which are moved into the frame.
+def _boxes(image: Tensor, side: int) -> Tensor:
+    """Means [H - side + 1, W - side + 1, C] of an image [H, W, C] over all squares of this side, in its own units."""
+    means = image.float()
+    for dim in (0, 1):
+        length = means.shape[dim] - side + 1
+        rows = means.narrow(dim, 0, length).clone()
+        for shift in range(1, side):
+            rows += means.narrow(dim, shift, length)
+        means = rows / side
+    return means
 
-    Between pixels by bilinear interpolation, in the image's own units.
+
+def _read(boxes: Tensor, position: Tensor, side: int) -> Tensor:
+    """Means [M, C] over the boxes around x, y [M, 2], moved into the frame; between pixels by bilinear interpolation.
+
+    Args:
+        boxes: see `_boxes`.
+        position: in the photo, pixels.
+        side: of the boxes.
     """
+    last = position.new_tensor([boxes.shape[1] - 1, boxes.shape[0] - 1])
+    corner = torch.minimum((position - side / 2).clamp_min(0), last)
+    (left, top), (x, y) = corner.long().unbind(dim=-1), corner.frac()[..., None].unbind(dim=1)
+    right, bottom = (left + 1).clamp_max(boxes.shape[1] - 1), (top + 1).clamp_max(boxes.shape[0] - 1)
+    upper, lower = (boxes[row, left].lerp(boxes[row, right], x) for row in (top, bottom))
+    return upper.lerp(lower, y)
+
+
+def _patch_means(image: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
+    """Means [M, C] of an image [h, w, C] over squares around pixels [M], of these sides [M], cut off at the frame."""
     height, width = image.shape[:2]
-    most = center.new_tensor([width - side, height - side])
-    corner = torch.minimum((center - side / 2).clamp_min(0), most)
-    first = corner.floor()
-    # The first pixel of a row counts by its part in the box, and so does the one after the last whole one.
-    weights = torch.ones(*center.shape, side + 1, device=center.device)
-    weights[..., -1] = corner - first
-    weights[..., 0] -= weights[..., -1]
-    x, y = (first.long()[..., None] + torch.arange(side + 1, device=center.device)).unbind(dim=1)
-    values = image[y.clamp_max(height - 1)[:, :, None], x.clamp_max(width - 1)[:, None, :]].float()
-    return torch.einsum("mijc,mj,mi->mc", values, *weights.unbind(dim=1)) / side**2
+    sums = nn.functional.pad(image.double().cumsum(0).cumsum(1), (0, 0, 1, 0, 1, 0))
+    place = torch.stack([pixel % width, pixel // width], dim=-1)
+    first = (place + 0.5 - side[:, None] / 2).round().long()
+    last = (first + side[:, None].round().long()).minimum(place.new_tensor([width, height]))
+    (left, top), (right, bottom) = first.clamp_min(0).unbind(dim=-1), last.unbind(dim=-1)
+    total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    return (total / ((right - left) * (bottom - top))[:, None]).float()
 
 
-def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Indices of the points that the view sees, their working pixels, and their positions in the photo."""
+def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) -> _Sight:
+    """The points that a view sees."""
     height, width = size
     index, position, depth = project(
         points, view.world_to_camera, view.intrinsics, height * reduction, width * reduction
@@ -180,4 +234,4 @@ def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) 
     side = 2 * OCCLUSION_RADIUS + 1
     nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
     seen = depth <= nearest.flatten()[pixel] * (1 + OCCLUSION_TOLERANCE)
-    return index[seen], pixel[seen], position[seen]
+    return _Sight(index, pixel, position, depth)[seen]

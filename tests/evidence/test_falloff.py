@@ -55,6 +55,14 @@ def test_a_falloff_is_found_up_to_the_clearest_part_of_the_frame(seed: int) -> N
     assert (found - (FALLOFF / clearest).clamp_max(1)).abs().max() < 0.04
 
 
+def test_patches_count_not_the_points_own_colors() -> None:
+    whole = samples(FALLOFF)
+    nearer = replace(whole, color=whole.color * (1 + 0.5 * (X**2 + Y**2)).flatten()[whole.pixel, None])
+    expected = estimate_falloff(whole)
+    assert (estimate_falloff(nearer) - expected).abs().max() > 0.1
+    torch.testing.assert_close(estimate_falloff(replace(nearer, patch=whole.color)), expected)
+
+
 @pytest.mark.parametrize("name", NOT_RADIAL)
 def test_what_is_not_radial_or_not_darkest_outside_is_no_falloff(name: str) -> None:
     assert (estimate_falloff(samples(NOT_RADIAL[name])) == 1).all()

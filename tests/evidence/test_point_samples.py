@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence import point_samples
 from ssa_nerfstudio.evidence.initialization import guide_of
@@ -79,6 +79,37 @@ def test_a_sample_shows_the_layers_of_its_pixel_on_either_side_of_an_edge(dtype:
     torch.testing.assert_close(samples.color, expected[:, None].expand(-1, 3), atol=0.01, rtol=0)
     between = sample_points(points, views)
     assert ((between.color - expected[:, None]).abs() > 0.05).any(), "without the photos' mean and deviation"
+
+
+def plane(distance: float) -> View:
+    """A camera before a plane of bright dots, 0.02 wide and 0.1 apart, with as much light on average everywhere."""
+    side, focal = 4, 600.0
+    y, x = torch.meshgrid(*(torch.arange(side * n) / side + 0.5 / side for n in (540, 960)), indexing="ij")
+    dots = [((each * distance / focal + 0.01) % 0.1 < 0.02).float() for each in (x - 480, y - 270)]
+    photo = nn.functional.avg_pool2d((0.1 + 0.8 * dots[0] * dots[1])[None], side)[0, ..., None].expand(-1, -1, 3)
+    pose = torch.eye(4)
+    pose[2, 3] = distance
+    return View(photo, None, pose, torch.tensor([[focal, 0, 480], [0, focal, 270], [0, 0, 1]]))
+
+
+def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
+    """A dot covers a working pixel from 2 units, and a sixth of one from 5."""
+    points = torch.tensor([[0.1 * i, 0.1 * j, 0.0] for i in (-2, -1, 0, 1) for j in (-1, 0, 1)])
+    samples = sample_points(points, [plane(2.0), plane(5.0)])
+    near, far = ((samples.view == view).nonzero()[:, 0] for view in (0, 1))
+    assert samples.point[near].tolist() == samples.point[far].tolist() == list(range(12))
+    assert (samples.color[near] - samples.color[far]).min() > 0.3
+    assert samples.patch is not None
+    assert (samples.patch[near] - samples.patch[far]).abs().max() < 0.06
+
+
+def test_a_patch_is_the_mean_of_what_no_mask_covers() -> None:
+    mask = torch.ones(540, 960, dtype=torch.bool)
+    mask[:, :476] = False
+    image = torch.where(mask[..., None], 0.75, 0.25).expand(-1, -1, 3)
+    intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
+    samples = sample_points(torch.tensor([[0.002, 0.0, 0.6]]), [View(image, mask, torch.eye(4), intrinsics)])
+    torch.testing.assert_close(samples.patch, torch.full((1, 3), 0.75))
 
 
 def test_a_box_that_a_mask_touches_is_left_out() -> None:
