@@ -141,6 +141,18 @@ def broken_scene(tiny_scene: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(tiny_scene, tmp_path / "scene"))
 
 
+@pytest.fixture
+def scene_of_two_cameras(broken_scene: Path) -> Path:
+    """The tiny scene, photographed by two cameras in turn, whose principal points differ."""
+    path = broken_scene / "transforms.json"
+    transforms = json.loads(path.read_text())
+    shared = {name: transforms.pop(name) for name in ("fl_x", "fl_y", "cx", "cy", "w", "h")}
+    for number, frame in enumerate(transforms["frames"]):
+        frame |= {**shared, "cx": shared["cx"] + 1.5 * (number % 2)}
+    path.write_text(json.dumps(transforms))
+    return broken_scene
+
+
 @pytest.fixture(autouse=True)
 def no_event_writers_left():
     """nerfstudio keeps event writers in a global: one test's would go on writing into its folder in the next."""

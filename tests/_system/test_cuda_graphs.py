@@ -167,6 +167,35 @@ def test_every_kind_is_recorded_at_its_second_call_and_anew_in_another_epoch(dev
 
 
 @pytest.mark.parametrize("device", ["cpu", CUDA])
+def test_inputs_of_another_type_or_shape_are_no_inputs_of_a_recording(device):
+    mixture = Mixture(device)
+    calls, parameters = RecordedCalls(recorder(device)), [mixture.weights]
+    for _ in range(3):
+        x, offset, picture = mixture.inputs()
+        for inputs in (
+            [x, offset, picture],
+            [x, offset, picture + 0.5],  # which a recording with integers would round
+            [x, offset.expand(5, 3).contiguous(), picture],
+        ):
+            expected = outcome(mixture, inputs, 1.0)
+            mixture.weights.grad = None
+            torch.testing.assert_close(found(calls(mixture, inputs, parameters, "kind"), mixture, 1.0), expected)
+    assert [each is not None for each in calls._known.values()] == [True] * 3
+
+
+def test_nothing_is_recorded_under_autocast(monkeypatch):
+    """A recording would go on in the types of the step that made it."""
+    mixture, made = Mixture("cpu"), Counted(run_again)
+    calls, inputs = RecordedCalls(made), mixture.inputs()
+    for autocast in (True, False):
+        monkeypatch.setattr(torch, "is_autocast_enabled", lambda autocast=autocast: autocast)
+        for _ in range(3):
+            mixture.weights.grad = None
+            calls(mixture, inputs, [mixture.weights], "kind")
+        assert made.programs == (0 if autocast else 2)
+
+
+@pytest.mark.parametrize("device", ["cpu", CUDA])
 def test_gradients_reach_a_parameter_that_took_anothers_place_in_memory(device):
     """As gsplat's relocation does: new parameters around the same numbers."""
     mixture = Mixture(device)

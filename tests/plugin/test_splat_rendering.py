@@ -223,6 +223,26 @@ def test_recordings_of_fewer_gaussians_are_given_up_once_there_are_too_many_to_r
     assert kept() is None
 
 
+@pytest.mark.parametrize(("count", "usable", "recorded"), [(50, True, True), (51, True, False), (50, False, False)])
+def test_projections_are_recorded_up_to_a_number_of_gaussians_where_graphs_can_be_used(
+    monkeypatch, count, usable, recorded
+):
+    given, seen = parameters(count, "cpu"), []
+
+    def render(calls: RecordedCalls | None, *_) -> LearnedRender:
+        seen.append(calls)
+        return LearnedRender(torch.zeros(1, HEIGHT, WIDTH, 3), torch.zeros(1, HEIGHT, WIDTH, 1), {})
+
+    monkeypatch.setattr(splat_rendering, "MOST_RECORDED", 50)
+    monkeypatch.setattr(splat_rendering, "graphs_are_usable", lambda: usable)
+    monkeypatch.setattr(splat_rendering, "render_learned", render)
+    monkeypatch.setattr(SplatRenderer, "_is_gsplat", lambda self, device: True)
+    renderer, (viewmats, Ks) = SplatRenderer("auto"), cameras(0, "cpu")
+    options = {"near_plane": 0.01, "sh_degree": 3, "render_mode": "RGB", "absgrad": False, "rasterize_mode": "classic"}
+    renderer.learned(given, viewmats, Ks, WIDTH, HEIGHT, **options)
+    assert seen == [renderer.projections if recorded else None]
+
+
 def test_what_is_drawn_is_the_activated_scene():
     given = parameters(50, "cpu")
     for with_harmonics in (True, False):

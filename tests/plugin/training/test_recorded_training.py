@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from recordings import CUDA, recorder
@@ -25,7 +27,7 @@ SETTINGS = pytest.mark.parametrize(
 def set_up(tiny_scene, tmp_path_factory, configure_training):
     """Make a trainer, halving photos for ten steps."""
 
-    def make(device: str, settings: dict) -> SSATrainer:
+    def make(device: str, settings: dict, scene: Path = tiny_scene) -> SSATrainer:
         options = {
             "overlay": "on",
             "overlay_start": "constant",
@@ -33,7 +35,7 @@ def set_up(tiny_scene, tmp_path_factory, configure_training):
             "resolution_schedule": 10,
             **settings,
         }
-        config = configure_training("ssa-splatfacto", tiny_scene, tmp_path_factory.mktemp("run"), 100, options)
+        config = configure_training("ssa-splatfacto", scene, tmp_path_factory.mktemp("run"), 100, options)
         config.scale_schedules, config.machine.device_type = False, device
         torch.manual_seed(0)
         config.set_timestamp()
@@ -117,6 +119,30 @@ def test_recorded_losses_have_the_same_gradients(set_up, monkeypatch, device, se
             assert difference <= (0 if device == "cpu" else 1e-4), (name, step)  # gsplat adds in any order
     recordings = [each for each in model._recorded._known.values() if each is not None]
     assert len(recordings) == 1
+
+
+def test_cameras_of_two_groups_have_a_recording_each(set_up, monkeypatch, scene_of_two_cameras):
+    """A recording composites the overlay of the group that it was made with."""
+    gradients = []
+    for recorded in (False, True):
+        record_losses(monkeypatch, recorded)
+        trainer = set_up("cpu", {}, scene_of_two_cameras)
+        model = trainer.pipeline.model
+        assert len(model.artifacts) == 2
+        model.step_cb(trainer.optimizers, 20)
+        trainer.pipeline.train()
+        gradients.append([])
+        for step in range(8):
+            camera, batch = trainer.pipeline.datamanager.next_train(step)
+            trainer.optimizers.zero_grad_some(list(trainer.optimizers.parameters))
+            torch.manual_seed(step)
+            loss = torch.stack(list(model.get_loss_dict(model(camera), batch).values())).sum()
+            if loss.requires_grad:
+                loss.backward()
+            gradients[-1] += [None if p.grad is None else p.grad.clone() for p in model.artifacts.parameters()]
+        monkeypatch.undo()
+    assert [each is not None for each in model._recorded._known.values()] == [True, True]
+    assert all((a is None) == (b is None) and (a is None or torch.equal(a, b)) for a, b in zip(*gradients, strict=True))
 
 
 def test_recorded_steps_log_what_plain_ones_do(set_up, monkeypatch):
