@@ -247,7 +247,7 @@ class SSATrainer(Trainer):
         if scale <= self.grad_scaler.get_scale():  # a scaler that is lowered has skipped the step
             optimizers.scheduler_step_all(step)
         if optimizers.guard is not None:
-            optimizers.guard.mask_densification(self.pipeline.model.info)
+            optimizers.guard.tell_densification(self.pipeline.model.info)
             if (step + 1) % CHECK_EVERY == 0:
                 optimizers.guard.check(step)
         return loss, {name: value.detach() for name, value in losses.items()}, metrics

@@ -107,7 +107,7 @@ class NonFiniteGuard:
             search(values, verdict.skipped, factor)
         torch.logical_not(verdict.skipped, out=verdict.taken)
 
-    def mask_densification(self, info: dict[str, Any]) -> None:
+    def tell_densification(self, info: dict[str, Any]) -> None:
         """Tell the densification whether the step that was judged last is taken.
 
         Args:

@@ -262,7 +262,7 @@ def test_a_skipped_step_is_masked_out_of_the_densification():
         parameter.grad = torch.full((3,), value)
         guard.judge(LOSS, {"p": adam(parameter)})
         info = {"radii": torch.tensor([[3, 0, 7]], dtype=torch.int32)}
-        guard.mask_densification(info)
+        guard.tell_densification(info)
         assert info["taken"] == taken
         statistics = GradientStatistics(torch.ones(3), torch.zeros(3), torch.zeros(3))
         statistics.add(torch.full((3, 2), value), info["radii"][0], 10, 10, 1, info["taken"])
@@ -621,7 +621,7 @@ def test_the_guard_never_waits_for_the_device_between_two_checks():
             verdict = guard.judge(LOSS, {"p": optimizer})
             with torch.no_grad():
                 optimizer.update(verdict.skipped)
-            guard.mask_densification({"radii": torch.ones(1, 3, dtype=torch.int32)})
+            guard.tell_densification({"radii": torch.ones(1, 3, dtype=torch.int32)})
     assert guard.check(2) == 1
 
 
