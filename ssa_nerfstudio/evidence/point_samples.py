@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence import brightness
-from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, UNKNOWN_DEVIATION
 
 WORKING_SIZE = brightness.WORKING_SIZE // 2
 """Photos are reduced by the integer that brings their longer side nearest to this, pixels: half of detection's."""
@@ -48,7 +48,7 @@ class PointSamples:
     pixel: Tensor
     """[S] int64: working pixel, row by row."""
     color: Tensor
-    """[S, 3], at least 0, about 1 at most but for a view's gain: what the photo shows of the point."""
+    """[S, 3] in [0, 1], brighter only by a view's gain: what the photo shows of the point."""
     points: int
     """Number of points."""
     size: tuple[int, int]
@@ -56,7 +56,7 @@ class PointSamples:
     view: Tensor
     """[S] int64: index of the view."""
     patch: Tensor | None = None
-    """[S, 3]: mean color around the point, over the same patch of the scene in every view; None: as `color`."""
+    """[S, 3]: mean color around the point, over a footprint of constant size in the scene; None: not read."""
 
     def ordered(self) -> PointSamples:
         """Sorted by point, then by brightness."""
@@ -95,17 +95,19 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     A photo is read where the point is, through a box as large as a working pixel. Read in the working pixel around it,
     up to half of that from the point, it would show something else of the scene. But layers are those of the pixel,
     and where the artifact has an edge, the box around the point has others. So a sample is brought to its pixel by
-    the mean M and the deviation D of the photos, which the artifact changes to T M + B and T D: of a color I at the
-    point, it is M + (I - M') D / D' with M', D' at the point.
+    matching mean and deviation: with the mean M and the deviation D of the photos in the pixel, and M', D' in the box
+    around the point, a color I' is M + (I' - M') D / D' in the pixel, because in front of the same scene an artifact
+    changes M to T M + B and D to T D.
 
-    A box shows the less of the scene the nearer it is. So the color of a point changes with its distance, and on a walk
-    with its place in the frame. Patches are as wide as the window of occlusions where the point is farthest, and the
-    wider the nearer it is.
+    The nearer a point, the smaller the part of the scene that a box covers. So the color of a point changes with its
+    distance, and on a walk with its place in the frame. `patch` is the mean over a footprint whose width in the frame
+    is inversely proportional to depth: that of the window of occlusions where the point is farthest.
 
     Args:
         points: [N, 3], world units; those that are not finite are left out.
         views: of one size, at least one.
-        guide: M and D of the photos, [H, W, 4]; None: samples are left as they are read.
+        guide: M and D of the photos, [H, W, 4], see `initialization.guide_of`; where D is unknown, and without a guide,
+            samples are left as they are read. Without one, patches are not read.
 
     Returns:
         The samples, on the points' device.
@@ -115,8 +117,10 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     reduction = working_reduction(height, width)
     size = height // reduction, width // reduction
     if guide is not None:
-        guide = _boxes(guide.to(points.device), reduction)
-        of_pixels = guide[::reduction, ::reduction].reshape(-1, 4)
+        guide = guide.to(points.device)
+        unknown = guide[..., 3:] == UNKNOWN_DEVIATION
+        guide = _boxes(torch.cat([guide, unknown], dim=-1), reduction)
+        of_pixels = guide[::reduction, ::reduction].reshape(-1, 5)
     sights = [_visible(points, view, reduction, size) for view in views]
     depth, seen = torch.cat([sight.depth for sight in sights]), torch.cat([sight.index for sight in sights])
     farthest = depth.new_zeros(len(points)).scatter_reduce(0, seen, depth, "amax")
@@ -128,23 +132,23 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
             unmasked = _boxes(mask, reduction)
             inside = unmasked[::reduction, ::reduction].flatten()[sight.pixel] == 1
             sight = sight[inside & (_read(unmasked, sight.position, reduction)[:, 0] > 1 - GRAY_LEVEL)]
-        white = points.new_full((3,), {torch.uint8: 255, torch.uint16: 65535}.get(image.dtype, 1))
-        white = white if view.gain is None else white * view.gain.to(white)
+        white = points.new_full((3,), {torch.uint8: 255, torch.uint16: 65535}.get(image.dtype, 1)).float()
+        gain = torch.ones_like(white) if view.gain is None else view.gain.to(white)
         boxes = _boxes(image, reduction)
-        color = _read(boxes, sight.position, reduction) / white
+        color, patch = _read(boxes, sight.position, reduction) / (white * gain), None
         if guide is not None:
-            mean, deviation = of_pixels[sight.pixel].split((3, 1), dim=-1)
-            mean_there, deviation_there = _read(guide, sight.position, reduction).split((3, 1), dim=-1)
-            # A gray level, because photos are rounded.
-            ratio = (deviation + GRAY_LEVEL) / (deviation_there + GRAY_LEVEL)
-            color = (mean + (color - mean_there) * ratio).clamp_min(0)
-        if mask is not None:
-            boxes = torch.cat([_boxes(image * mask, reduction), unmasked], dim=-1)
-        side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
-        patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
-        patch = patch / white if mask is None else patch[:, :3] / patch[:, 3:] / white
+            here, there = of_pixels[sight.pixel], _read(guide, sight.position, reduction)
+            color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
+            color = color.clamp_min(0).minimum(1 / gain)
+            if mask is not None:
+                boxes = torch.cat([_boxes(image * mask, reduction), unmasked], dim=-1)
+            side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
+            patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
+            patch = (patch if mask is None else patch[:, :3] / patch[:, 3:]) / (white * gain)
         found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), patch))
-    point, pixel, color, shown_by, patch = (torch.cat(parts) for parts in zip(*found, strict=True))
+    *parts, patches = zip(*found, strict=True)
+    point, pixel, color, shown_by = (torch.cat(part) for part in parts)
+    patch = None if guide is None else torch.cat(patches)
     return PointSamples(point, pixel, color, len(points), size, shown_by, patch).ordered()
 
 
@@ -181,6 +185,13 @@ def project(
     return index, position[index], depth[index]
 
 
+def _matched(color: Tensor, here: Tensor, there: Tensor) -> Tensor:
+    """Colors [M, 3] with mean and deviation [M, 4 or more] from there brought to those here."""
+    # A gray level, because photos are rounded.
+    ratio = (here[:, 3:4] + GRAY_LEVEL) / (there[:, 3:4] + GRAY_LEVEL)
+    return here[:, :3] + (color - there[:, :3]) * ratio
+
+
 def _boxes(image: Tensor, side: int) -> Tensor:
     """Means [H - side + 1, W - side + 1, C] of an image [H, W, C] over all squares of this side, in its own units."""
     means = image.float()
@@ -203,7 +214,7 @@ def _read(boxes: Tensor, position: Tensor, side: int) -> Tensor:
     """
     last = position.new_tensor([boxes.shape[1] - 1, boxes.shape[0] - 1])
     corner = torch.minimum((position - side / 2).clamp_min(0), last)
-    (left, top), (x, y) = corner.long().unbind(dim=-1), corner.frac()[..., None].unbind(dim=1)
+    (left, top), (x, y) = corner.long().unbind(dim=-1), corner.frac().to(boxes)[..., None].unbind(dim=1)
     right, bottom = (left + 1).clamp_max(boxes.shape[1] - 1), (top + 1).clamp_max(boxes.shape[0] - 1)
     upper, lower = (boxes[row, left].lerp(boxes[row, right], x) for row in (top, bottom))
     return upper.lerp(lower, y)
@@ -214,8 +225,9 @@ def _patch_means(image: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
     height, width = image.shape[:2]
     sums = nn.functional.pad(image.double().cumsum(0).cumsum(1), (0, 0, 1, 0, 1, 0))
     place = torch.stack([pixel % width, pixel // width], dim=-1)
-    first = (place + 0.5 - side[:, None] / 2).round().long()
-    last = (first + side[:, None].round().long()).minimum(place.new_tensor([width, height]))
+    side = side[:, None].round().clamp_max(2 * max(height, width))
+    first = (place + 0.5 - side / 2).round().long()
+    last = (first + side.long()).minimum(place.new_tensor([width, height]))
     (left, top), (right, bottom) = first.clamp_min(0).unbind(dim=-1), last.unbind(dim=-1)
     total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
     return (total / ((right - left) * (bottom - top))[:, None]).float()

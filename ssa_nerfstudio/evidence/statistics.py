@@ -11,6 +11,8 @@ from ssa_nerfstudio.evidence.brightness import BrightnessBlocks
 
 GRAY_LEVEL = 1 / 255
 """Step of 8 bits, by which photos are rounded (white = 1). Less than half of it is no difference."""
+UNKNOWN_DEVIATION = 1.0
+"""More than any pixel can have, which is 0.5."""
 _FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
 _MAX_VIEWS_IN_INT32 = 33_000
 """So many squares of uint8 add up to less than 2^31."""
@@ -106,7 +108,7 @@ class ImageStatistics:
     def deviation(self) -> Tensor:
         """Largest standard deviation (of the population) among the channels: [H, W, 1] float64 in [0, 0.5].
 
-        With fewer than two views it is 1, more than any pixel can have: nothing is known to be static there.
+        With fewer than two views it is UNKNOWN_DEVIATION: nothing is known to be static there.
         """
         views = self.views
         total = self._total()
@@ -114,7 +116,7 @@ class ImageStatistics:
         spread = (views * self._squares.to(total.dtype) - total * total).clamp_min(0).to(torch.float64)
         deviation = spread.sqrt() / (views.clamp_min(1) * self._scale)
         deviation = deviation.amax(dim=-1, keepdim=True)
-        return torch.where(views > 1, deviation, torch.ones_like(deviation))
+        return torch.where(views > 1, deviation, torch.full_like(deviation, UNKNOWN_DEVIATION))
 
     def _total(self) -> Tensor:
         assert self._sum is not None

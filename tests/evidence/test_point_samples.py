@@ -9,8 +9,10 @@ from torch import Tensor, nn
 from ssa_nerfstudio.evidence import point_samples
 from ssa_nerfstudio.evidence.initialization import guide_of
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
-from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.evidence.statistics import UNKNOWN_DEVIATION, accumulate
 
+UNKNOWN = torch.full((540, 960, 4), UNKNOWN_DEVIATION)
+"""Of photos of which no two show a pixel: samples are left as they are read."""
 K = torch.tensor([[40.0, 0.0, 30.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]])
 
 
@@ -95,21 +97,84 @@ def plane(distance: float) -> View:
 def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
     """A dot covers a working pixel from 2 units, and a sixth of one from 5."""
     points = torch.tensor([[0.1 * i, 0.1 * j, 0.0] for i in (-2, -1, 0, 1) for j in (-1, 0, 1)])
-    samples = sample_points(points, [plane(2.0), plane(5.0)])
+    samples = sample_points(points, [plane(2.0), plane(5.0)], UNKNOWN)
     near, far = ((samples.view == view).nonzero()[:, 0] for view in (0, 1))
     assert samples.point[near].tolist() == samples.point[far].tolist() == list(range(12))
     assert (samples.color[near] - samples.color[far]).min() > 0.3
     assert samples.patch is not None
-    assert (samples.patch[near] - samples.patch[far]).abs().max() < 0.06
+    assert (samples.patch[near] - samples.patch[far]).abs().max() < 0.02
 
 
-def test_a_patch_is_the_mean_of_what_no_mask_covers() -> None:
-    mask = torch.ones(540, 960, dtype=torch.bool)
-    mask[:, :476] = False
-    image = torch.where(mask[..., None], 0.75, 0.25).expand(-1, -1, 3)
+def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks() -> None:
+    """Of noise, around points in the frame's corners and beside a mask, under a gain for each channel."""
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randint(0, 256, (40, 60, 3), generator=generator, dtype=torch.uint8)
+    mask = torch.rand(40, 60, generator=generator) > 0.2
+    gain = torch.tensor([0.5, 1.0, 2.0])
+    place = torch.tensor([[0, 0], [59, 0], [0, 39], [59, 39], [30, 20], [20, 38], [57, 21]])
+    depth = torch.tensor([2.1, 3.0, 2.5, 2.1, 4.0, 2.1, 3.0])
+    points = torch.cat([(place + 0.5 - torch.tensor([30.0, 20.0])) / 40, torch.ones(7, 1)], dim=-1) * depth[:, None]
+    mask[place[:, 1], place[:, 0]] = True
+    back = torch.eye(4)
+    back[2, 3] = 3.0  # the points are farther from there
+    for seen in (None, mask):
+        first = View(image, seen, torch.eye(4), K, gain)
+        samples = sample_points(points, [first, View(image, None, back, K)], UNKNOWN[:40, :60])
+        assert samples.patch is not None
+        own = (samples.view == 0).nonzero()[:, 0]
+        assert samples.point[own].tolist() == list(range(7))
+        for at in own.tolist():
+            column, row = place[samples.point[at]].tolist()
+            side = round(5 * float((depth[samples.point[at]] + 3) / depth[samples.point[at]]))
+            left, top = (round(each + 0.5 - side / 2) for each in (column, row))
+            part = slice(max(top, 0), top + side), slice(max(left, 0), left + side)
+            counts = (torch.ones(40, 60, dtype=torch.bool) if seen is None else seen)[part]
+            expected = image[part][counts].float().mean(dim=0) / 255 / gain
+            assert side % 2 == 0 or (side - 1) / 2 == column - left  # odd ones are around the pixel
+            torch.testing.assert_close(samples.patch[at], expected)
+
+
+def test_colors_are_brought_to_one_exposure_and_bounded_by_white() -> None:
+    points = torch.tensor([[0.5, -0.25, 2.0]])
+    gain = torch.tensor([0.5, 1.0, 2.0])
+    image = torch.full((40, 60, 3), 0.6)
+    samples = sample_points(points, [View(image, None, torch.eye(4), K, gain)])
+    torch.testing.assert_close(samples.color, torch.tensor([[1.2, 0.6, 0.3]]))
+    assert samples.patch is None
+    # What is behind an opaque edge hardly varies: one photo that shows something else there is an outlier.
+    still = torch.where(torch.arange(60) < 40, 0.02, 0.5)[:, None].expand(40, 60, 3)
+    guide = torch.cat([still, torch.where(torch.arange(60) < 40, 0.001, 0.25).expand(40, 60)[..., None]], dim=-1)
+    points = torch.tensor([[0.5, -0.25, 1.9999], [0.5 + 0.01, -0.25, 2.0]])  # on either side of column 40
+    for value, white in ((1.0, True), (0.0, False)):
+        samples = sample_points(points, [View(torch.full((40, 60, 3), value), None, torch.eye(4), K, gain)], guide)
+        bound = 1 / gain if white else torch.zeros(3)
+        assert (samples.color == bound).all(dim=-1).any()
+        assert (samples.color <= 1 / gain).all()
+        assert (samples.color >= 0).all()
+
+
+def test_where_too_few_photos_show_a_pixel_samples_stay_as_they_are_read() -> None:
+    """The left half of the frame is masked in all photos but one."""
+    left = torch.ones(540, 960, dtype=torch.bool)
+    left[:, :480] = False
+    images, masks = [torch.full((540, 960, 3), value) for value in (0.3, 0.5, 0.7)], [None, left, left]
     intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
-    samples = sample_points(torch.tensor([[0.002, 0.0, 0.6]]), [View(image, mask, torch.eye(4), intrinsics)])
-    torch.testing.assert_close(samples.patch, torch.full((1, 3), 0.75))
+    points = torch.stack([torch.linspace(-0.02, 0.02, 60), torch.linspace(-0.4, 0.4, 60), torch.ones(60)], dim=1)
+    views = [View(image, mask, torch.eye(4), intrinsics) for image, mask in zip(images, masks, strict=True)]
+    samples = sample_points(points, views, guide_of(accumulate(zip(images, masks, strict=True))))
+    expected = torch.tensor([0.3, 0.5, 0.7])[samples.view, None].expand(-1, 3)
+    torch.testing.assert_close(samples.color, expected)
+
+
+def test_points_of_any_type_at_absurd_depths_are_sampled() -> None:
+    points = torch.tensor([[0.0, 0.0, 2e-6], [0.5, -0.25, 2.0]], dtype=torch.float64)
+    far = torch.eye(4, dtype=torch.float64)
+    far[2, 3] = 1e20
+    views = [View(coordinates(), None, pose, K) for pose in (torch.eye(4), far)]
+    samples = sample_points(points, views, UNKNOWN[:40, :60])
+    assert samples.patch is not None
+    assert torch.isfinite(samples.patch).all()
+    assert torch.isfinite(samples.color).all()
 
 
 def test_a_box_that_a_mask_touches_is_left_out() -> None:
@@ -122,6 +187,21 @@ def test_a_box_that_a_mask_touches_is_left_out() -> None:
     mask[:, :480] = False
     samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
     assert samples.point.tolist() == [], "the box around 481.5 begins at 479.5"
+    mask[:, :481] = False
+    beside = torch.tensor([[0.0034, 0.0, 0.6], [0.0054, 0.0, 0.6]])  # at 483.4 and 485.4
+    samples = sample_points(beside, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
+    assert samples.point.tolist() == [1], "the first is in a working pixel that begins at 480"
+
+
+def test_rounding_of_what_hardly_varies_is_not_enlarged() -> None:
+    """A panel before all photos: its deviations of a tenth and a hundredth of a gray level say nothing."""
+    level = 1 / 255
+    image = torch.full((40, 60, 3), 0.5 + level)
+    deviation = torch.where(torch.arange(60) < 40, 0.01 * level, 0.1 * level).expand(40, 60)[..., None]
+    guide = torch.cat([torch.full((40, 60, 3), 0.5), deviation], dim=-1)
+    points = torch.tensor([[0.5 + 0.01, -0.25, 2.0]])  # its box is in both parts
+    samples = sample_points(points, [View(image, None, torch.eye(4), K)], guide)
+    assert (samples.color - image[0, 0]).abs().max() < 0.2 * level
 
 
 def test_large_photos_are_reduced_and_many_points_thinned(monkeypatch) -> None:
