@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence import brightness
-from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, UNKNOWN_DEVIATION
+from ssa_nerfstudio.evidence.statistics import FULL_SCALE, GRAY_LEVEL, UNKNOWN_DEVIATION
 
 WORKING_SIZE = brightness.WORKING_SIZE // 2
 """Photos are reduced by the integer that brings their longer side nearest to this, pixels: half of detection's."""
@@ -126,13 +126,13 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     farthest = depth.new_zeros(len(points)).scatter_reduce(0, seen, depth, "amax")
     found = []
     for number, (view, sight) in enumerate(zip(views, sights, strict=True)):
-        image, mask = view.image[..., :3].to(points.device), None
+        image, unmasked = view.image[..., :3].to(points.device), None
         if view.mask is not None:
-            mask = (view.mask.reshape(height, width, 1) != 0).to(image)
-            unmasked = _boxes(mask, reduction)
+            mask = view.mask.reshape(height, width, 1).to(points.device) != 0
+            image, unmasked = torch.where(mask, image, 0), _boxes(mask, reduction)
             inside = unmasked[::reduction, ::reduction].flatten()[sight.pixel] == 1
             sight = sight[inside & (_read(unmasked, sight.position, reduction)[:, 0] > 1 - GRAY_LEVEL)]
-        white = points.new_full((3,), {torch.uint8: 255, torch.uint16: 65535}.get(image.dtype, 1)).float()
+        white = points.new_full((3,), FULL_SCALE.get(image.dtype, 1.0), dtype=torch.float32)
         gain = torch.ones_like(white) if view.gain is None else view.gain.to(white)
         boxes = _boxes(image, reduction)
         color, patch = _read(boxes, sight.position, reduction) / (white * gain), None
@@ -140,11 +140,10 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
             here, there = of_pixels[sight.pixel], _read(guide, sight.position, reduction)
             color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
             color = color.clamp_min(0).minimum(1 / gain)
-            if mask is not None:
-                boxes = torch.cat([_boxes(image * mask, reduction), unmasked], dim=-1)
+            boxes = boxes if unmasked is None else torch.cat([boxes, unmasked], dim=-1)
             side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
             patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
-            patch = (patch if mask is None else patch[:, :3] / patch[:, 3:]) / (white * gain)
+            patch = (patch if unmasked is None else patch[:, :3] / patch[:, 3:]) / (white * gain)
         found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), patch))
     *parts, patches = zip(*found, strict=True)
     point, pixel, color, shown_by = (torch.cat(part) for part in parts)

@@ -13,7 +13,8 @@ GRAY_LEVEL = 1 / 255
 """Step of 8 bits, by which photos are rounded (white = 1). Less than half of it is no difference."""
 UNKNOWN_DEVIATION = 1.0
 """More than any pixel can have, which is 0.5."""
-_FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
+FULL_SCALE = {torch.uint8: 255.0, torch.uint16: 65535.0}
+"""White of the integer types; 1 of all others."""
 _MAX_VIEWS_IN_INT32 = 33_000
 """So many squares of uint8 add up to less than 2^31."""
 
@@ -49,9 +50,9 @@ class ImageStatistics:
         """
         image = image[..., :3]
         if self._sum is None:
-            exact = image.dtype in _FULL_SCALE
+            exact = image.dtype in FULL_SCALE
             self._dtype = image.dtype
-            self._scale = _FULL_SCALE.get(image.dtype, 1.0)
+            self._scale = FULL_SCALE.get(image.dtype, 1.0)
             # int32 halves the memory traffic until its sums could overflow.
             kind = torch.int32 if image.dtype == torch.uint8 else torch.int64 if exact else torch.float64
             self._sum = torch.zeros(image.shape, dtype=kind, device=image.device)

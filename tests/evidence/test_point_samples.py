@@ -13,6 +13,8 @@ from ssa_nerfstudio.evidence.statistics import UNKNOWN_DEVIATION, accumulate
 
 UNKNOWN = torch.full((540, 960, 4), UNKNOWN_DEVIATION)
 """Of photos of which no two show a pixel: samples are left as they are read."""
+LARGE_K = torch.tensor([[600.0, 0.0, 480.0], [0.0, 600.0, 270.0], [0.0, 0.0, 1.0]])
+"""Of a frame of 960 x 540 pixels, four to a working pixel."""
 K = torch.tensor([[40.0, 0.0, 30.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]])
 
 
@@ -70,8 +72,7 @@ def test_a_sample_shows_the_layers_of_its_pixel_on_either_side_of_an_edge(dtype:
     brightness = torch.linspace(0.2, 0.9, 7)
     images = [(layers[..., :1] * each + layers[..., 1:]).expand(-1, -1, 3) for each in brightness]
     images = [image if dtype == torch.float32 else (255 * image).round().to(dtype) for image in images]
-    intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
-    views = [View(image, None, torch.eye(4), intrinsics) for image in images]
+    views = [View(image, None, torch.eye(4), LARGE_K) for image in images]
     points = torch.stack(torch.meshgrid(torch.linspace(-0.03, 0.03, 40), torch.tensor([0.0, 0.3]), indexing="ij"), -1)
     points = torch.cat([points.reshape(-1, 2), torch.full((80, 1), 2.0)], dim=-1)
     samples = sample_points(points, views, guide_of(accumulate((image, None) for image in images)))
@@ -85,13 +86,13 @@ def test_a_sample_shows_the_layers_of_its_pixel_on_either_side_of_an_edge(dtype:
 
 def plane(distance: float) -> View:
     """A camera before a plane of bright dots, 0.02 wide and 0.1 apart, with as much light on average everywhere."""
-    side, focal = 4, 600.0
+    side, focal = 4, float(LARGE_K[0, 0])
     y, x = torch.meshgrid(*(torch.arange(side * n) / side + 0.5 / side for n in (540, 960)), indexing="ij")
     dots = [((each * distance / focal + 0.01) % 0.1 < 0.02).float() for each in (x - 480, y - 270)]
     photo = nn.functional.avg_pool2d((0.1 + 0.8 * dots[0] * dots[1])[None], side)[0, ..., None].expand(-1, -1, 3)
     pose = torch.eye(4)
     pose[2, 3] = distance
-    return View(photo, None, pose, torch.tensor([[focal, 0, 480], [0, focal, 270], [0, 0, 1]]))
+    return View(photo, None, pose, LARGE_K)
 
 
 def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
@@ -134,6 +135,17 @@ def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks() -> 
             torch.testing.assert_close(samples.patch[at], expected)
 
 
+def test_what_a_mask_hides_is_never_read() -> None:
+    """Not even where it is no number."""
+    image, mask = torch.full((540, 960, 3), 0.75), torch.ones(540, 960, dtype=torch.bool)
+    mask[:, :476] = False
+    image[~mask] = torch.nan
+    points = torch.tensor([[0.002, 0.0, 0.6], [0.1, 0.1, 0.6]])
+    samples = sample_points(points, [View(image, mask, torch.eye(4), LARGE_K)], UNKNOWN)
+    torch.testing.assert_close(samples.patch, torch.full((2, 3), 0.75))
+    torch.testing.assert_close(samples.color, torch.full((2, 3), 0.75))
+
+
 def test_colors_are_brought_to_one_exposure_and_bounded_by_white() -> None:
     points = torch.tensor([[0.5, -0.25, 2.0]])
     gain = torch.tensor([0.5, 1.0, 2.0])
@@ -158,9 +170,8 @@ def test_where_too_few_photos_show_a_pixel_samples_stay_as_they_are_read() -> No
     left = torch.ones(540, 960, dtype=torch.bool)
     left[:, :480] = False
     images, masks = [torch.full((540, 960, 3), value) for value in (0.3, 0.5, 0.7)], [None, left, left]
-    intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
     points = torch.stack([torch.linspace(-0.02, 0.02, 60), torch.linspace(-0.4, 0.4, 60), torch.ones(60)], dim=1)
-    views = [View(image, mask, torch.eye(4), intrinsics) for image, mask in zip(images, masks, strict=True)]
+    views = [View(image, mask, torch.eye(4), LARGE_K) for image, mask in zip(images, masks, strict=True)]
     samples = sample_points(points, views, guide_of(accumulate(zip(images, masks, strict=True))))
     expected = torch.tensor([0.3, 0.5, 0.7])[samples.view, None].expand(-1, 3)
     torch.testing.assert_close(samples.color, expected)
@@ -180,16 +191,15 @@ def test_points_of_any_type_at_absurd_depths_are_sampled() -> None:
 def test_a_box_that_a_mask_touches_is_left_out() -> None:
     mask = torch.ones(540, 960, dtype=torch.bool)
     mask[:, :478] = False  # the working pixel from 480 to 483 is seen
-    intrinsics = torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]])
     points = torch.tensor([[-0.001, 0.0, 0.6], [0.0015, 0.0, 0.6], [0.0005, 0.1, 0.6]])  # at 479, 481.5 and 480.5
-    samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
+    samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), LARGE_K)])
     assert samples.point.tolist() == [1, 2]
     mask[:, :480] = False
-    samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
+    samples = sample_points(points, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), LARGE_K)])
     assert samples.point.tolist() == [], "the box around 481.5 begins at 479.5"
     mask[:, :481] = False
     beside = torch.tensor([[0.0034, 0.0, 0.6], [0.0054, 0.0, 0.6]])  # at 483.4 and 485.4
-    samples = sample_points(beside, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), intrinsics)])
+    samples = sample_points(beside, [View(torch.zeros(540, 960, 3), mask, torch.eye(4), LARGE_K)])
     assert samples.point.tolist() == [1], "the first is in a working pixel that begins at 480"
 
 
@@ -206,7 +216,7 @@ def test_rounding_of_what_hardly_varies_is_not_enlarged() -> None:
 
 def test_large_photos_are_reduced_and_many_points_thinned(monkeypatch) -> None:
     image = torch.full((540, 960, 4), 51, dtype=torch.uint8)
-    big = View(image, None, torch.eye(4), torch.tensor([[600.0, 0, 480], [0, 600, 270], [0, 0, 1]]))
+    big = View(image, None, torch.eye(4), LARGE_K)
     points = torch.rand(1000, 3) * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([-0.5, -0.5, 2.0])
     samples = sample_points(points, [big, big])
     assert samples.size == (135, 240)
