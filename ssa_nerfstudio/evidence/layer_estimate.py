@@ -114,7 +114,8 @@ def estimate_layers(
         noise = _noise(samples, weight, residual)
         dependence = 1 + (repeats - 1) * _correlation(place, repeats, residual * (weight / noise).sqrt())
         behind = colors[point]
-        precision = weight / (scale**2 * (noise + uncertainty) * dependence)
+        # Noisier places count no less: what changes in front of the scene is noisy, too, and would pass for clear.
+        precision = weight / (scale**2 * (noise.clamp_max(1) + uncertainty) * dependence)
         moments = torch.cat(
             [
                 torch.ones_like(precision),
