@@ -106,16 +106,12 @@ def estimate_layers(
     prior = torch.ones_like(layers[..., :1])
     residual = _initial_residual(samples, clear, constant)
     seen_by = torch.bincount(point, minlength=samples.points)[point]
-    noise, uncertainty = torch.ones_like(prior).reshape(-1, 1)[pixel], 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
-    place, repeats = _places(samples)
+    uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
     for round_ in range(ROUNDS):
         scale = 1.48 * residual.abs().median() + GRAY_LEVEL
         weight = 1 / (1 + residual.square().mean(dim=-1, keepdim=True) / (OUTLIER_SCALE * scale) ** 2)
-        noise = _noise(samples, weight, residual)
-        dependence = 1 + (repeats - 1) * _correlation(place, repeats, residual * (weight / noise).sqrt())
         behind = colors[point]
-        # Noisier places count no less: what changes in front of the scene is noisy, too, and would pass for clear.
-        precision = weight / (scale**2 * (noise.clamp_max(1) + uncertainty) * dependence)
+        precision = weight / (scale**2 * (1 + uncertainty))
         moments = torch.cat(
             [
                 torch.ones_like(precision),
@@ -136,8 +132,7 @@ def estimate_layers(
         brightest = layers[..., 0].flatten().kthvalue(clearest).values.clamp_min(0.5)
         layers = torch.cat([layers[..., :1] / brightest, layers[..., 1:]], dim=-1).clamp(0, 1)
         transmitted, added = layers.reshape(-1, 4)[pixel].split((1, 3), dim=-1)
-        share = weight / noise
-        seen = torch.cat([share * transmitted * (observed - added), share * transmitted.square()], dim=-1)
+        seen = torch.cat([weight * transmitted * (observed - added), weight * transmitted.square()], dim=-1)
         total = summed(point, seen, samples.points)
         colors = torch.where(total[:, 3:] > 0.01, total[:, :3] / total[:, 3:].clamp_min(1e-6), colors).clamp(0, 1)
         # Of the color from the other samples: a point seen once says nothing.
@@ -162,53 +157,6 @@ def _initial_residual(samples: PointSamples, clear: Tensor, constant: Tensor) ->
     excess = (constant.abs() - clear.abs()).sum(dim=-1, keepdim=True)
     around = local_mean(summed(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
     return torch.where(around.reshape(-1, 1)[samples.pixel] < 0, constant, clear)
-
-
-def _noise(samples: PointSamples, weight: Tensor, residual: Tensor) -> Tensor:
-    """Variance [S, 1] of the residuals [S, 3] around each sample's pixel, relative to that of all.
-
-    Foliage and what moves scatter more than a wall. If all samples had one variance, a point's color would follow its
-    noisy samples, a slope of I over it would be too low where photos are calm, and the artifact a film there.
-
-    Args:
-        samples: of the scene's points.
-        weight: of the samples, [S, 1].
-        residual: I - T C - B.
-    """
-    height, width = samples.size
-    squares = weight * residual.square().mean(dim=-1, keepdim=True)
-    overall = (squares.sum() / weight.sum().clamp_min(1e-9)).clamp_min(1e-12)
-    sums = summed(samples.pixel, torch.cat([squares / overall, weight], dim=-1), height * width)
-    around = local_mean(sums.reshape(height, width, 2), OCCLUSION_RADIUS) * (2 * OCCLUSION_RADIUS + 1) ** 2
-    # One sample more, of the overall variance: a window with few samples says little.
-    return ((around[..., :1] + 1) / (around[..., 1:] + 1)).reshape(-1, 1)[samples.pixel]
-
-
-def _places(samples: PointSamples) -> tuple[Tensor, Tensor]:
-    """Which samples are of one point at one place: their group [S], and how many the group has [S, 1].
-
-    Places are windows of the size of that of occlusions. On a forward walk a far point stays at its place.
-    """
-    height, width = samples.size
-    side = 2 * OCCLUSION_RADIUS + 1
-    place = samples.pixel // width // side * width + samples.pixel % width // side
-    _, group, count = (samples.point * (height * width) + place).unique(return_inverse=True, return_counts=True)
-    return group, count[group][:, None].float()
-
-
-def _correlation(group: Tensor, count: Tensor, residual: Tensor) -> Tensor:
-    """Correlation, a number in [0, 1], of residuals [S, 3] of equal variance within groups.
-
-    Errors of a point's position or color are the same in every view that sees it at one place. So n samples of a group
-    say as much as n / (1 + (n - 1) r) independent ones (Kish's design effect).
-
-    Args:
-        group: of each sample, [S].
-        count: of the samples in its group, [S, 1].
-        residual: of each sample.
-    """
-    products = summed(group, residual, len(group)).square().sum() - residual.square().sum()
-    return (products / ((count - 1) * residual.square()).sum().clamp_min(1e-12)).clamp(0, 1)
 
 
 def _initial_colors(samples: PointSamples, deviation: Tensor) -> Tensor:

@@ -9,15 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.layer_estimate import (
-    SMOOTHNESS_FLOOR,
-    LayerEstimate,
-    _correlation,
-    _noise,
-    _places,
-    _smoothness,
-    estimate_layers,
-)
+from ssa_nerfstudio.evidence.layer_estimate import SMOOTHNESS_FLOOR, LayerEstimate, _smoothness, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
 HEIGHT, WIDTH = 36, 48
@@ -229,75 +221,3 @@ def test_layers_may_differ_between_neighbors_as_much_as_the_photos_do_there() ->
     torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + 0.25)))
     torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + 1), *[1 / floor] * 3]))
     assert (_smoothness(mean, deviation, 0) == 1 / floor).all()
-
-
-def test_calm_pixels_are_no_film_because_others_are_noisy() -> None:
-    """Foliage around a wall: with one variance for both, T of the wall is 0.975."""
-    samples, mean, deviation = observe(*ARTIFACTS["none"], views=4, points=6000, wrong=0.0)
-    generator = torch.Generator().manual_seed(4)
-    calm = disc(0.02).flatten()[samples.pixel] > 0.5
-    noise = 0.3 * torch.randn(samples.color.shape, generator=generator)
-    noisy = torch.where(calm[:, None], samples.color, (samples.color + noise).clamp(0, 1))
-    found = estimate_layers(replace(samples, color=noisy).ordered(), mean, deviation, NOWHERE, NOWHERE)
-    assert found.transmittance[disc(0.02) > 0.5].mean() > 0.99
-
-
-def test_one_error_of_a_point_that_many_views_repeat_counts_once() -> None:
-    """A walk: half of the views see a point at one place, and all of them with the same error.
-
-    As twenty independent samples they give a mean opacity of 0.017.
-    """
-    generator = torch.Generator().manual_seed(6)
-    points, views = 1000, 40
-    colors = BRIGHTEST * torch.rand(points, 3, generator=generator)
-    here, there = (torch.randint(HEIGHT * WIDTH, (points,), generator=generator) for _ in range(2))
-    wrong = 0.2 * torch.randn(points, 3, generator=generator)
-    point = torch.arange(points).repeat(views)
-    far = (torch.arange(views) < views // 2).repeat_interleave(points)
-    pixel = torch.where(far, here.repeat(views), there.repeat(views))
-    seen = colors[point] + far[:, None] * wrong[point] + 0.01 * torch.randn(len(point), 3, generator=generator)
-    view = torch.arange(views).repeat_interleave(points)
-    samples = PointSamples(point, pixel, seen.clamp(0, 1), points, (HEIGHT, WIDTH), view).ordered()
-    flat = torch.full((HEIGHT, WIDTH, 3), BRIGHTEST / 2)
-    found = estimate_layers(samples, flat, torch.full((HEIGHT, WIDTH, 1), 0.17), NOWHERE, NOWHERE)
-    assert (1 - found.transmittance).mean() < 0.005
-
-
-@pytest.mark.parametrize("shared", [0.0, 0.3, 0.8, 1.0])
-def test_correlation_within_groups_is_that_of_the_errors(shared: float) -> None:
-    """Errors with a common part of this share of the variance, in groups of one to five."""
-    generator = torch.Generator().manual_seed(3)
-    sizes = torch.randint(1, 6, (4000,), generator=generator)
-    group = torch.arange(4000).repeat_interleave(sizes)
-    common, own = torch.randn(4000, 3, generator=generator)[group], torch.randn(len(group), 3, generator=generator)
-    residual = shared**0.5 * common + (1 - shared) ** 0.5 * own
-    found = _correlation(group, sizes[group][:, None].float(), residual)
-    assert float(found) == pytest.approx(shared, abs=0.03)
-    assert _correlation(group[:1], torch.ones(1, 1), residual[:1]) == 0
-
-
-def test_samples_of_one_point_in_one_window_are_at_one_place() -> None:
-    point = torch.tensor([0, 0, 0, 0, 1])
-    row, column = torch.tensor([0, 4, 5, 0, 0]), torch.tensor([0, 4, 0, 5, 0])
-    samples = PointSamples(point, row * WIDTH + column, torch.rand(5, 3), 2, (HEIGHT, WIDTH), point)
-    group, count = _places(samples)
-    assert count.flatten().tolist() == [2, 2, 1, 1, 1]
-    assert group[0] == group[1]
-    assert len(group.unique()) == 4
-
-
-def test_variance_around_a_pixel_is_relative_to_that_of_all() -> None:
-    """The left half has nine times the variance of the right one; outliers without a weight do not count."""
-    samples, *_ = observe(*ARTIFACTS["none"])
-    left = samples.pixel % WIDTH < WIDTH // 2
-    residual = torch.where(left[:, None], 0.3, 0.1) * torch.randn(
-        samples.color.shape, generator=torch.Generator().manual_seed(7)
-    )
-    outlier = torch.arange(len(left)) % 10 == 0
-    residual[outlier] = 5.0
-    noise = _noise(samples, (~outlier).float()[:, None], residual)
-    inner = (samples.pixel % WIDTH - WIDTH // 2).abs() > 3
-    assert float(noise[left & inner].mean()) == pytest.approx(9 / 5, abs=0.1)
-    assert float(noise[~left & inner].mean()) == pytest.approx(1 / 5, abs=0.03)
-    nothing = _noise(samples, torch.ones_like(noise), torch.zeros_like(residual))
-    assert ((nothing > 0) & (nothing <= 1)).all()
