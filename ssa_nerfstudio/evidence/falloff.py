@@ -1,8 +1,9 @@
 """Falloff of light from the middle of the frame to its corners (vignetting), from the scene's points.
 
 A point has one color in all photos, so where log I changes with its pixel, something in front changes. A lens darkens
-by the distance from the frame's center alone. Shading, reflections and other artifacts have no reason to: what of the
-same smoothness is not radial says how much of the radial part may be theirs. docs/method.md derives it.
+by the angle to its axis alone, which is taken to be in the frame's center. Shading, reflections and other artifacts
+have no reason to: what of the same smoothness is not radial says how much of the radial part may be theirs.
+docs/method.md derives it.
 """
 
 from __future__ import annotations
@@ -12,8 +13,8 @@ from scipy.special import fdtrc
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
-from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE
-from ssa_nerfstudio.evidence.photo_exposure import DAMPING, MIN_SCALE, OUTLIER_SCALE, ROUNDS, USABLE
+from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE, OUTLIER_SCALE
+from ssa_nerfstudio.evidence.photo_exposure import DAMPING, ROUNDS, USABLE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
@@ -36,7 +37,7 @@ def estimate_falloff(samples: PointSamples) -> Tensor:
         unless the falloff is significant.
     """
     height, width = samples.size
-    modes = _modes(height, width).to(samples.color.device)
+    modes = _modes(height, width, samples.focal_ratio).to(samples.color.device)
     radial = modes[:, :RADIAL_MODES]
     found = _regression(samples, modes).square()
     nothing = samples.color.new_ones(height, width, 1)
@@ -68,11 +69,11 @@ def _ways_out(height: int, width: int) -> list[tuple[int, int]]:
     return [middle, ((middle[0] + corner[0]) // 2, (middle[1] + corner[1]) // 2), corner]
 
 
-def _modes(height: int, width: int) -> Tensor:
+def _modes(height: int, width: int, focal_ratio: float = 1.0) -> Tensor:
     """Polynomials of the position, orthonormal over the frame [h w, 17], float64: r^2 to r^10 and all others up to the
-    fourth degree."""
+    fourth degree. Positions are in focal lengths, because undistorted photos may be stretched."""
     y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
-    z = torch.complex(*torch.broadcast_tensors(x, y[:, None])).flatten() / max(height, width)
+    z = torch.complex(*torch.broadcast_tensors(x / focal_ratio, y[:, None])).flatten() / max(height, width)
     squared = z.abs().square()
     turning = [z, z**2, z * squared, z**3, z**2 * squared, z**4]
     radial = [squared**power for power in range(1, RADIAL_MODES + 1)]
@@ -82,7 +83,12 @@ def _modes(height: int, width: int) -> Tensor:
 
 
 def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
-    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, with Cauchy's weights."""
+    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes + k log z.
+
+    Points change with their depth z alike, because of haze and of what is around them. On a walk they are far in the
+    middle of the frame and near at its sides, so that this would look like a falloff. Noise has one variance in I,
+    so that of log I is inverse to the square of I; Cauchy's weights are of the residuals in I.
+    """
     # Of patches, because a point's own color changes with its distance.
     color = samples.color if samples.patch is None else samples.patch
     brightness, every = color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
@@ -92,18 +98,23 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
         return modes.new_zeros(modes.shape[1])
     known, point = samples.point[usable].unique(return_inverse=True)
     shown_by = torch.nn.functional.one_hot(samples.view[usable] // every)
-    columns = torch.cat([modes[samples.pixel[usable]], shown_by.to(modes)], dim=-1)
-    values = brightness[usable].clamp_min(GRAY_LEVEL).log()[:, None]
+    columns = [modes[samples.pixel[usable]], shown_by.to(modes)]
+    if samples.depth is not None:
+        columns.append(samples.depth[usable].to(modes).log()[:, None])
+    columns = torch.cat(columns, dim=-1)
+    shown = brightness[usable].clamp_min(GRAY_LEVEL)[:, None]
+    values, precision = shown.log(), shown.square()
     # The modes only need to be regular.
     damping = torch.full(columns.shape[1:], DAMPING, dtype=columns.dtype, device=columns.device)
     damping[: modes.shape[1]] = 1e-9
-    weight, solution = torch.ones_like(values), torch.zeros_like(damping)
+    weight, solution = precision, torch.zeros_like(damping)
     for _ in range(ROUNDS):
         total = summed(point, weight, len(known))
         centered = columns - (summed(point, weight * columns, len(known)) / total)[point]
         rest = values - (summed(point, weight * values, len(known)) / total)[point]
         weighted = weight * centered
         solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
-        rest = rest - centered @ solution
-        weight = 1 / (1 + (rest / (OUTLIER_SCALE * (1.48 * rest.abs().median() + MIN_SCALE))).square())
+        error = shown * (rest - centered @ solution)
+        scale = OUTLIER_SCALE * (1.48 * error.abs().median() + GRAY_LEVEL)
+        weight = precision / (1 + (error / scale).square())
     return solution.flatten()[: modes.shape[1]]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -57,14 +57,19 @@ class PointSamples:
     """[S] int64: index of the view."""
     patch: Tensor | None = None
     """[S, 3]: mean color around the point, over a footprint of constant size in the scene; None: not read."""
+    depth: Tensor | None = None
+    """[S]: of the point in the view, world units; None: not known."""
+    focal_ratio: float = 1.0
+    """Focal length along x by that along y, both in pixels: a circle around a lens's axis is an ellipse so many times
+    as wide as high."""
 
     def ordered(self) -> PointSamples:
         """Sorted by point, then by brightness."""
         order = torch.argsort(self.color.sum(dim=-1))
         order = order[torch.argsort(self.point[order], stable=True)]
         point, pixel, color, view = (each[order] for each in (self.point, self.pixel, self.color, self.view))
-        patch = None if self.patch is None else self.patch[order]
-        return PointSamples(point, pixel, color, self.points, self.size, view, patch)
+        patch, depth = (None if each is None else each[order] for each in (self.patch, self.depth))
+        return replace(self, point=point, pixel=pixel, color=color, view=view, patch=patch, depth=depth)
 
 
 @dataclass(frozen=True)
@@ -144,11 +149,13 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
             side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
             patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
             patch = (patch if unmasked is None else patch[:, :3] / patch[:, 3:]) / (white * gain)
-        found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), patch))
+        found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), sight.depth, patch))
     *parts, patches = zip(*found, strict=True)
-    point, pixel, color, shown_by = (torch.cat(part) for part in parts)
+    point, pixel, color, shown_by, depth = (torch.cat(part) for part in parts)
     patch = None if guide is None else torch.cat(patches)
-    return PointSamples(point, pixel, color, len(points), size, shown_by, patch).ordered()
+    focal_lengths = torch.stack([view.intrinsics.diagonal()[:2] for view in views]).mean(dim=0)
+    ratio = float(focal_lengths[0] / focal_lengths[1])
+    return PointSamples(point, pixel, color, len(points), size, shown_by, patch, depth, ratio).ordered()
 
 
 def regular_subset(points: Tensor, views: int) -> Tensor:
