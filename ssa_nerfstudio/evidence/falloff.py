@@ -71,7 +71,8 @@ def _ways_out(height: int, width: int) -> list[tuple[int, int]]:
 
 def _modes(height: int, width: int, focal_ratio: float = 1.0) -> Tensor:
     """Polynomials of the position, orthonormal over the frame [h w, 17], float64: r^2 to r^10 and all others up to the
-    fourth degree. Positions are in focal lengths, because undistorted photos may be stretched."""
+    fourth degree. x is divided by the ratio of focal lengths, so that r is proportional to the tangent of the angle to
+    the lens's axis: undistorted photos may be stretched."""
     y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
     z = torch.complex(*torch.broadcast_tensors(x / focal_ratio, y[:, None])).flatten() / max(height, width)
     squared = z.abs().square()
@@ -83,11 +84,12 @@ def _modes(height: int, width: int, focal_ratio: float = 1.0) -> Tensor:
 
 
 def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
-    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes + k log z.
+    """Coefficients [K] of modes [h w, K] in log I = log C + log g + k log z + modes; g of views, z the depth.
 
-    Points change with their depth z alike, because of haze and of what is around them. On a walk they are far in the
-    middle of the frame and near at its sides, so that this would look like a falloff. Noise has one variance in I,
-    so that of log I is inverse to the square of I; Cauchy's weights are of the residuals in I.
+    All points change alike with their depth, because of haze and their surroundings. On a walk a point is far in the
+    middle of the frame and near at its sides, which would look like a falloff. Noise is taken to have one variance in
+    I, so the variance of log I is inversely proportional to the square of I: of the fitted one, because outliers would
+    give themselves weight.
     """
     # Of patches, because a point's own color changes with its distance.
     color = samples.color if samples.patch is None else samples.patch
@@ -103,18 +105,20 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
         columns.append(samples.depth[usable].to(modes).log()[:, None])
     columns = torch.cat(columns, dim=-1)
     shown = brightness[usable].clamp_min(GRAY_LEVEL)[:, None]
-    values, precision = shown.log(), shown.square()
-    # The modes only need to be regular.
+    values = shown.log()
+    # The modes only need to be regular; gains and k are taken for none where nothing is known of them.
     damping = torch.full(columns.shape[1:], DAMPING, dtype=columns.dtype, device=columns.device)
     damping[: modes.shape[1]] = 1e-9
-    weight, solution = precision, torch.zeros_like(damping)
+    weight, solution = torch.ones_like(values), torch.zeros_like(damping)
     for _ in range(ROUNDS):
         total = summed(point, weight, len(known))
         centered = columns - (summed(point, weight * columns, len(known)) / total)[point]
         rest = values - (summed(point, weight * values, len(known)) / total)[point]
         weighted = weight * centered
         solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
-        error = shown * (rest - centered @ solution)
+        rest -= centered @ solution
+        fitted = (values - rest).exp().clamp(GRAY_LEVEL, 1)
+        error = fitted * rest
         scale = OUTLIER_SCALE * (1.48 * error.abs().median() + GRAY_LEVEL)
-        weight = precision / (1 + (error / scale).square())
+        weight = fitted.square() / fitted.square().mean() / (1 + (error / scale).square())
     return solution.flatten()[: modes.shape[1]]

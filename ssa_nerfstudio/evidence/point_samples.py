@@ -58,10 +58,10 @@ class PointSamples:
     patch: Tensor | None = None
     """[S, 3]: mean color around the point, over a footprint of constant size in the scene; None: not read."""
     depth: Tensor | None = None
-    """[S]: of the point in the view, world units; None: not known."""
+    """[S]: depth of the point in the view (z, not distance), world units; None: not known."""
     focal_ratio: float = 1.0
-    """Focal length along x by that along y, both in pixels: a circle around a lens's axis is an ellipse so many times
-    as wide as high."""
+    """Mean focal length of the views along x by that along y, both in pixels: a circle around the lens's axis is this
+    many times as wide as it is high."""
 
     def ordered(self) -> PointSamples:
         """Sorted by point, then by brightness."""
