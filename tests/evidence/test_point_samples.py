@@ -116,6 +116,12 @@ def test_samples_state_their_depth_and_the_ratio_of_focal_lengths() -> None:
     assert samples.depth is not None
     torch.testing.assert_close(samples.depth, points[samples.point, 2])
     assert samples.focal_ratio == pytest.approx(1.5)
+    behind = torch.ones(40, 90)
+    behind[:, : plain.image.shape[1] // 3] = 0
+    masked = sample_points(points, [replace(plain, mask=behind), plain])
+    assert masked.depth is not None
+    assert 0 < len(masked.point) < 2 * len(points)
+    torch.testing.assert_close(masked.depth, points[masked.point, 2])
 
 
 def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks() -> None:
