@@ -69,7 +69,7 @@ def _ways_out(height: int, width: int) -> list[tuple[int, int]]:
     return [middle, ((middle[0] + corner[0]) // 2, (middle[1] + corner[1]) // 2), corner]
 
 
-def _modes(height: int, width: int, focal_ratio: float = 1.0) -> Tensor:
+def _modes(height: int, width: int, focal_ratio: float) -> Tensor:
     """Polynomials of the position, orthonormal over the frame [h w, 17], float64: r^2 to r^10 and all others up to the
     fourth degree. x is divided by the ratio of focal lengths, so that r is proportional to the tangent of the angle to
     the lens's axis: undistorted photos may be stretched."""
