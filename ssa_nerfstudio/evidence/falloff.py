@@ -84,13 +84,7 @@ def _modes(height: int, width: int, focal_ratio: float) -> Tensor:
 
 
 def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
-    """Coefficients [K] of modes [h w, K] in log I = log C + log g + k log z + modes; g of views, z the depth.
-
-    All points change alike with their depth, because of haze and their surroundings. On a walk a point is far in the
-    middle of the frame and near at its sides, which would look like a falloff. Noise is taken to have one variance in
-    I, so the variance of log I is inversely proportional to the square of I: of the fitted one, because outliers would
-    give themselves weight.
-    """
+    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, g of views, with Cauchy's weights."""
     # Of patches, because a point's own color changes with its distance.
     color = samples.color if samples.patch is None else samples.patch
     brightness, every = color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
@@ -100,13 +94,9 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
         return modes.new_zeros(modes.shape[1])
     known, point = samples.point[usable].unique(return_inverse=True)
     shown_by = torch.nn.functional.one_hot(samples.view[usable] // every)
-    columns = [modes[samples.pixel[usable]], shown_by.to(modes)]
-    if samples.depth is not None:
-        columns.append(samples.depth[usable].to(modes).log()[:, None])
-    columns = torch.cat(columns, dim=-1)
-    shown = brightness[usable].clamp_min(GRAY_LEVEL)[:, None]
-    values = shown.log()
-    # The modes only need to be regular; gains and k are taken for none where nothing is known of them.
+    columns = torch.cat([modes[samples.pixel[usable]], shown_by.to(modes)], dim=-1)
+    values = brightness[usable].clamp_min(GRAY_LEVEL).log()[:, None]
+    # The modes only need to be regular; gains are taken for none where nothing is known of them.
     damping = torch.full(columns.shape[1:], DAMPING, dtype=columns.dtype, device=columns.device)
     damping[: modes.shape[1]] = 1e-9
     weight, solution = torch.ones_like(values), torch.zeros_like(damping)
@@ -117,8 +107,6 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
         weighted = weight * centered
         solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
         rest -= centered @ solution
-        fitted = (values - rest).exp().clamp(GRAY_LEVEL, 1)
-        error = fitted * rest
-        scale = OUTLIER_SCALE * (1.48 * error.abs().median() + GRAY_LEVEL)
-        weight = fitted.square() / fitted.square().mean() / (1 + (error / scale).square())
+        scale = OUTLIER_SCALE * (1.48 * rest.abs().median() + GRAY_LEVEL)
+        weight = 1 / (1 + (rest / scale).square())
     return solution.flatten()[: modes.shape[1]]

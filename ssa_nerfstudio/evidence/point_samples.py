@@ -57,8 +57,6 @@ class PointSamples:
     """[S] int64: index of the view."""
     patch: Tensor | None = None
     """[S, 3]: mean color around the point, over a footprint of constant size in the scene; None: not read."""
-    depth: Tensor | None = None
-    """[S]: depth of the point in the view (z, not distance), world units; None: not known."""
     focal_ratio: float = 1.0
     """Mean focal length of the views along x by that along y, both in pixels: a circle around the lens's axis is this
     many times as wide as it is high."""
@@ -68,8 +66,8 @@ class PointSamples:
         order = torch.argsort(self.color.sum(dim=-1))
         order = order[torch.argsort(self.point[order], stable=True)]
         point, pixel, color, view = (each[order] for each in (self.point, self.pixel, self.color, self.view))
-        patch, depth = (None if each is None else each[order] for each in (self.patch, self.depth))
-        return replace(self, point=point, pixel=pixel, color=color, view=view, patch=patch, depth=depth)
+        patch = None if self.patch is None else self.patch[order]
+        return replace(self, point=point, pixel=pixel, color=color, view=view, patch=patch)
 
 
 @dataclass(frozen=True)
@@ -149,13 +147,13 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
             side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
             patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
             patch = (patch if unmasked is None else patch[:, :3] / patch[:, 3:]) / (white * gain)
-        found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), sight.depth, patch))
+        found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), patch))
     *parts, patches = zip(*found, strict=True)
-    point, pixel, color, shown_by, depth = (torch.cat(part) for part in parts)
+    point, pixel, color, shown_by = (torch.cat(part) for part in parts)
     patch = None if guide is None else torch.cat(patches)
     focal_lengths = torch.stack([view.intrinsics.diagonal()[:2] for view in views]).mean(dim=0)
     ratio = float(focal_lengths[0] / focal_lengths[1])
-    return PointSamples(point, pixel, color, len(points), size, shown_by, patch, depth, ratio).ordered()
+    return PointSamples(point, pixel, color, len(points), size, shown_by, patch, ratio).ordered()
 
 
 def regular_subset(points: Tensor, views: int) -> Tensor:

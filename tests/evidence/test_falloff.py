@@ -64,19 +64,6 @@ def test_patches_count_not_the_points_own_colors() -> None:
     torch.testing.assert_close(estimate_falloff(replace(nearer, patch=whole.color)), expected)
 
 
-def test_points_that_change_with_their_depth_are_no_falloff() -> None:
-    """A walk in haze: the farther from the middle a point is seen, the nearer and darker it is."""
-    whole = samples(FALLOFF)
-    generator = torch.Generator().manual_seed(1)
-    depth = (1.5 - torch.hypot(X, Y)).flatten()[whole.pixel]
-    depth *= (1 + torch.rand(POINTS, generator=generator))[whole.point]
-    depth *= (0.2 * torch.randn(len(depth), generator=generator)).exp()
-    hazy = replace(whole, color=whole.color * (depth[:, None] / 4) ** 0.3, depth=depth)
-    expected = estimate_falloff(whole)
-    assert (estimate_falloff(replace(hazy, depth=None)) - expected).abs().max() > 0.05
-    assert (estimate_falloff(hazy) - expected).abs().max() < 0.03
-
-
 def test_a_falloff_is_round_in_angles_not_in_pixels() -> None:
     """Photos stretched by 1.25 along x, as undistortion may leave them."""
     stretched = 1 - 0.7 * ((X / 1.25).square() + Y.square()) ** 1.5

@@ -108,20 +108,11 @@ def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
     assert (samples.patch[near] - samples.patch[far]).abs().max() < 0.02
 
 
-def test_samples_state_their_depth_and_the_ratio_of_focal_lengths() -> None:
-    points = torch.tensor([[0.0, 0.0, 2.0], [0.4, 0.0, 5.0], [-0.4, 0.0, 3.0]])
+def test_samples_state_the_ratio_of_focal_lengths() -> None:
     plain = view(torch.rand(40, 90, 3))
     stretched = replace(plain, intrinsics=torch.diag(torch.tensor([1.5, 1.0, 1.0])) @ plain.intrinsics)
-    samples = sample_points(points, [stretched, stretched])
-    assert samples.depth is not None
-    torch.testing.assert_close(samples.depth, points[samples.point, 2])
-    assert samples.focal_ratio == pytest.approx(1.5)
-    behind = torch.ones(40, 90)
-    behind[:, : plain.image.shape[1] // 3] = 0
-    masked = sample_points(points, [replace(plain, mask=behind), plain])
-    assert masked.depth is not None
-    assert 0 < len(masked.point) < 2 * len(points)
-    torch.testing.assert_close(masked.depth, points[masked.point, 2])
+    points = torch.tensor([[0.0, 0.0, 2.0], [0.4, 0.0, 5.0], [-0.4, 0.0, 3.0]])
+    assert sample_points(points, [stretched, stretched]).focal_ratio == pytest.approx(1.5)
 
 
 def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks() -> None:
