@@ -19,6 +19,8 @@ OCCLUSION_RADIUS = 2
 """Working pixels."""
 MAX_PROJECTIONS = 5_000_000
 """Points times views; of more points a regular subset is projected, whose samples are dense enough."""
+VIEWS_AT_ONCE = 64
+"""Whose points are compared by depth at once; more only cost memory."""
 MIN_DEPTH = 1e-6
 """World units; points nearer to a camera's plane are behind it."""
 
@@ -71,20 +73,19 @@ class PointSamples:
 
 
 @dataclass(frozen=True)
-class _Sight:
-    """The M points that a view sees."""
+class _Sights:
+    """M pairs of a view and a point that it sees, view by view."""
 
-    index: Tensor
-    """[M] int64."""
+    view: Tensor
+    """[M] int64: index of the view."""
+    point: Tensor
+    """[M] int64: index of the point."""
     pixel: Tensor
     """[M] int64: working pixel, row by row."""
     position: Tensor
     """[M, 2]: x and y in the photo."""
     depth: Tensor
     """[M]."""
-
-    def __getitem__(self, kept: Tensor) -> _Sight:
-        return _Sight(self.index[kept], self.pixel[kept], self.position[kept], self.depth[kept])
 
 
 def working_reduction(height: int, width: int) -> int:
@@ -124,33 +125,38 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
         unknown = guide[..., 3:] == UNKNOWN_DEVIATION
         guide = _boxes(torch.cat([guide, unknown], dim=-1), reduction)
         of_pixels = guide[::reduction, ::reduction].reshape(-1, 5)
-    sights = [_visible(points, view, reduction, size) for view in views]
-    depth, seen = torch.cat([sight.depth for sight in sights]), torch.cat([sight.index for sight in sights])
-    farthest = depth.new_zeros(len(points)).scatter_reduce(0, seen, depth, "amax")
-    found = []
-    for number, (view, sight) in enumerate(zip(views, sights, strict=True)):
-        image, unmasked = view.image[..., :3].to(points.device), None
+    seen = _visible(points, views, reduction, size)
+    farthest = seen.depth.new_zeros(len(points)).scatter_reduce(0, seen.point, seen.depth, "amax")
+    footprint = (2 * OCCLUSION_RADIUS + 1) * farthest[seen.point] / seen.depth
+    counts = torch.bincount(seen.view, minlength=len(views)).tolist()
+    by_view = (each.split(counts) for each in (seen.pixel, seen.position, footprint))
+    colors, patches, unhidden = [], [], []
+    for view, pixel, position, side in zip(views, *by_view, strict=True):
+        image, unmasked, here = view.image[..., :3].to(points.device), None, torch.ones_like(pixel, dtype=torch.bool)
         if view.mask is not None:
             mask = view.mask.reshape(height, width, 1).to(points.device) != 0
             image, unmasked = torch.where(mask, image, 0), _boxes(mask, reduction)
-            inside = unmasked[::reduction, ::reduction].flatten()[sight.pixel] == 1
-            sight = sight[inside & (_read(unmasked, sight.position, reduction)[:, 0] > 1 - GRAY_LEVEL)]
-        white = points.new_full((3,), FULL_SCALE.get(image.dtype, 1.0), dtype=torch.float32)
-        gain = torch.ones_like(white) if view.gain is None else view.gain.to(white)
+            here = unmasked[::reduction, ::reduction].flatten()[pixel] == 1
+            here &= _read(unmasked, position, reduction)[:, 0] > 1 - GRAY_LEVEL
+        unhidden.append(here)
         boxes = _boxes(image, reduction)
-        color, patch = _read(boxes, sight.position, reduction) / (white * gain), None
+        colors.append(_read(boxes, position, reduction))
         if guide is not None:
-            here, there = of_pixels[sight.pixel], _read(guide, sight.position, reduction)
-            color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
-            color = color.clamp_min(0).minimum(1 / gain)
             boxes = boxes if unmasked is None else torch.cat([boxes, unmasked], dim=-1)
-            side = (2 * OCCLUSION_RADIUS + 1) * farthest[sight.index] / sight.depth
-            patch = _patch_means(boxes[::reduction, ::reduction], sight.pixel, side)
-            patch = (patch if unmasked is None else patch[:, :3] / patch[:, 3:]) / (white * gain)
-        found.append((sight.index, sight.pixel, color, torch.full_like(sight.index, number), patch))
-    *parts, patches = zip(*found, strict=True)
-    point, pixel, color, shown_by = (torch.cat(part) for part in parts)
-    patch = None if guide is None else torch.cat(patches)
+            patch = _patch_means(boxes[::reduction, ::reduction], pixel, side)
+            patches.append(patch if unmasked is None else patch[:, :3] / patch[:, 3:])
+    same = torch.ones(3, device=points.device)
+    gains = torch.stack([same if view.gain is None else view.gain.to(same) for view in views])
+    white = gains * gains.new_tensor([[FULL_SCALE.get(view.image.dtype, 1.0)] for view in views])
+    color, patch = torch.cat(colors) / white[seen.view], None
+    if guide is not None:
+        here, there = of_pixels[seen.pixel], _read(guide, seen.position, reduction)
+        color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
+        color = color.clamp_min(0).minimum(1 / gains[seen.view])
+        patch = torch.cat(patches) / white[seen.view]
+    kept = torch.cat(unhidden)
+    point, pixel, color, shown_by = (each[kept] for each in (seen.point, seen.pixel, color, seen.view))
+    patch = None if patch is None else patch[kept]
     focal_lengths = torch.stack([view.intrinsics.diagonal()[:2] for view in views]).mean(dim=0)
     ratio = float(focal_lengths[0] / focal_lengths[1])
     return PointSamples(point, pixel, color, len(points), size, shown_by, patch, ratio).ordered()
@@ -168,25 +174,27 @@ def summed(index: Tensor, values: Tensor, count: int) -> Tensor:
 
 def project(
     points: Tensor, world_to_camera: Tensor, intrinsics: Tensor, height: int, width: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Project points into a camera's frame.
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Project points into the frames of cameras.
 
     Args:
         points: [N, 3], world units.
-        world_to_camera: [4, 4], OpenCV's axes.
-        intrinsics: [3, 3], pixels.
-        height, width: of the frame, pixels.
+        world_to_camera: [V, 4, 4], OpenCV's axes.
+        intrinsics: [V, 3, 3], pixels.
+        height, width: of the frames, pixels.
 
     Returns:
-        Of the M points in the frame: their indices [M], positions x, y [M, 2] in pixels, and depths [M].
+        Of the M pairs of a camera and a point in its frame, camera by camera: indices of the camera and of the point
+        [M], positions x, y [M, 2] in pixels, and depths [M].
     """
-    pose = world_to_camera.to(points)
-    camera = points @ pose[:3, :3].T + pose[:3, 3]
-    depth = camera[:, 2]
-    position = (camera @ intrinsics.to(points).T)[:, :2] / depth[:, None].clamp_min(MIN_DEPTH)
+    poses, lenses = world_to_camera.to(points), intrinsics.to(points)
+    in_camera = points @ poses[:, :3, :3].mT + poses[:, None, :3, 3]
+    depth = in_camera[..., 2]
+    position = (in_camera @ lenses.mT)[..., :2] / depth[..., None].clamp_min(MIN_DEPTH)
     x, y = position.unbind(dim=-1)
-    index = ((depth > MIN_DEPTH) & (x >= 0) & (x < width) & (y >= 0) & (y < height)).nonzero()[:, 0]
-    return index, position[index], depth[index]
+    inside = (depth > MIN_DEPTH) & (x >= 0) & (x < width) & (y >= 0) & (y < height)
+    camera, point = inside.nonzero(as_tuple=True)
+    return camera, point, position[camera, point], depth[camera, point]
 
 
 def _matched(color: Tensor, here: Tensor, there: Tensor) -> Tensor:
@@ -237,17 +245,21 @@ def _patch_means(image: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
     return (total / ((right - left) * (bottom - top))[:, None]).float()
 
 
-def _visible(points: Tensor, view: View, reduction: int, size: tuple[int, int]) -> _Sight:
-    """The points that a view sees."""
+def _visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[int, int]) -> _Sights:
+    """The points that views see."""
     height, width = size
-    index, position, depth = project(
-        points, view.world_to_camera, view.intrinsics, height * reduction, width * reduction
-    )
-    x, y = (position / reduction).long().unbind(dim=-1)
-    pixel = y * width + x
-    nearest = torch.full((height * width,), torch.inf, device=points.device, dtype=depth.dtype)
-    nearest = nearest.scatter_reduce(0, pixel, depth, "amin").reshape(1, 1, height, width)
     side = 2 * OCCLUSION_RADIUS + 1
-    nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
-    seen = depth <= nearest.flatten()[pixel] * (1 + OCCLUSION_TOLERANCE)
-    return _Sight(index, pixel, position, depth)[seen]
+    found = []
+    for first in range(0, len(views), VIEWS_AT_ONCE):
+        some = views[first : first + VIEWS_AT_ONCE]
+        poses, lenses = (torch.stack([getattr(v, name) for v in some]) for name in ("world_to_camera", "intrinsics"))
+        view, point, position, depth = project(points, poses, lenses, height * reduction, width * reduction)
+        x, y = (position / reduction).long().unbind(dim=-1)
+        pixel = y * width + x
+        place = view * (height * width) + pixel
+        nearest = torch.full((len(some) * height * width,), torch.inf, device=points.device, dtype=depth.dtype)
+        nearest = nearest.scatter_reduce(0, place, depth, "amin").reshape(-1, height, width)
+        nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
+        seen = depth <= nearest.flatten()[place] * (1 + OCCLUSION_TOLERANCE)
+        found.append([each[seen] for each in (view + first, point, pixel, position, depth)])
+    return _Sights(*(torch.cat(each) for each in zip(*found, strict=True)))

@@ -47,6 +47,7 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
         (["mutants.py", "--budget", "nan"], 2, "--budget must be at least 1, got nan"),
         (["start_time.py", "--data", "x", "--rounds", "0"], 2, "--rounds must be at least 1, got 0"),
         (["start_time.py", "--data", "x", "--methods"], 2, "no method is given"),
+        (["initialization_time.py", "--data", "nowhere"], 2, "nowhere"),
     ],
 )
 def test_a_script_ends_as_a_command_does(arguments, code, said):

@@ -29,9 +29,7 @@ def nearest_depth(points: Tensor, view_matrices: Tensor, Ks: Tensor, width: int,
         width, height: of the largest frame, pixels.
     """
     points = regular_subset(points, len(view_matrices))
-    view_matrices, Ks = view_matrices.to(points), Ks.to(points)  # at once instead of view by view
-    seen = [project(points, pose, K, height, width)[2] for pose, K in zip(view_matrices, Ks, strict=True)]
-    depths = torch.cat(seen)
+    depths = project(points, view_matrices, Ks, height, width)[3]
     depths = depths[depths > NEAR_PLANE]
     return float(depths.kthvalue(1 + int(NEAREST_SHARE * (len(depths) - 1))).values) if len(depths) else None
 
