@@ -8,16 +8,14 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, View, regular_subset, sample_points
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 USABLE = (0.04, 0.96)
 """Values whose logarithm says something about exposure: above the noise of dark pixels, below clipping."""
 ROUNDS = 10
 """Of reweighting."""
-OUTLIER_SCALE = 3.0
-"""Residuals beyond so many standard deviations lose their weight (Cauchy): artifacts, reflections, hidden points."""
-MIN_SCALE = 0.01
-"""Standard deviation of log I that photos of 8 bits have at least."""
 MIN_WEIGHT = 1e-3
 """Of a sample at a pixel that shows the same in all photos."""
 DAMPING = 1.0
@@ -104,7 +102,7 @@ def _regression(values: Tensor, certainty: Tensor) -> Tensor:
         rest = values - views[:, None]
         rest = rest - (share * rest).sum(dim=0)
         if usable.any():
-            scale = OUTLIER_SCALE * (1.48 * rest[usable].abs().median() + MIN_SCALE)
+            scale = OUTLIER_SCALE * (1.48 * rest[usable].abs().median() + GRAY_LEVEL)
             weight = certainty / (1 + (rest / scale).square())
     return (views - views.mean()).float()
 
