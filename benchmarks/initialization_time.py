@@ -1,7 +1,8 @@
 """Seconds of each part of an overlay's initialization: `python benchmarks/initialization_time.py --data DIR`
 
 Each round is a process of its own, because loading kernels is part of a start. Parts are timed with the GPU idle before
-and after, which costs little: nearly all of them end with a value that is read.
+and after. They are nested: `learned_overlays` is all of it, and `estimate` holds `estimate_falloff` and
+`estimate_layers`.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ class Command:
         found = [_parts(self.data) for _ in range(self.rounds)]
         print("| part | seconds | median |\n|---|---|---|")
         for part in found[0]:
-            seconds = [each[part] for each in found]
+            seconds = [each.get(part, 0.0) for each in found]
             print(f"| `{part}` | {', '.join(f'{value:.2f}' for value in seconds)} | {statistics.median(seconds):.2f} |")
 
 
@@ -81,7 +82,7 @@ def _parts(data: Path) -> dict[str, float]:
     lines = [line for line in process.stdout.splitlines() if line.startswith("PARTS ")]
     if not lines:
         reason = (process.stderr.strip() or process.stdout.strip()).rpartition("\n")[2]
-        raise InputError(f"the overlay was not initialized: {reason}", "start a training by ns-train to see why")
+        raise InputError(f"the overlay was not initialized: {reason}", "try to train on it by ns-train")
     return json.loads(lines[0].removeprefix("PARTS "))
 
 

@@ -20,7 +20,7 @@ OCCLUSION_RADIUS = 2
 MAX_PROJECTIONS = 5_000_000
 """Points times views; of more points a regular subset is projected, whose samples are dense enough."""
 VIEWS_AT_ONCE = 64
-"""Whose points are compared by depth at once; more only cost memory."""
+"""Views whose points are compared by depth together; a larger number only costs memory."""
 MIN_DEPTH = 1e-6
 """World units; points nearer to a camera's plane are behind it."""
 
@@ -255,11 +255,12 @@ def _visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[
         poses, lenses = (torch.stack([getattr(v, name) for v in some]) for name in ("world_to_camera", "intrinsics"))
         view, point, position, depth = project(points, poses, lenses, height * reduction, width * reduction)
         x, y = (position / reduction).long().unbind(dim=-1)
-        pixel = y * width + x
+        # A GPU multiplies by 1 / reduction, rounded, which may bring a position to the frame's edge.
+        pixel = y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
         place = view * (height * width) + pixel
         nearest = torch.full((len(some) * height * width,), torch.inf, device=points.device, dtype=depth.dtype)
         nearest = nearest.scatter_reduce(0, place, depth, "amin").reshape(-1, height, width)
         nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
-        seen = depth <= nearest.flatten()[place] * (1 + OCCLUSION_TOLERANCE)
+        seen = (depth <= nearest.flatten()[place] * (1 + OCCLUSION_TOLERANCE)).nonzero()[:, 0]
         found.append([each[seen] for each in (view + first, point, pixel, position, depth)])
     return _Sights(*(torch.cat(each) for each in zip(*found, strict=True)))

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import initialization_time
+
 FOLDER = Path(__file__).parents[2] / "benchmarks"
 
 
@@ -56,3 +58,11 @@ def test_a_script_ends_as_a_command_does(arguments, code, said):
     assert done.returncode == code
     assert said in (done.stderr if code else done.stdout)
     assert len(done.stderr.splitlines()) == (1 if code else 0)
+
+
+def test_an_initialization_is_timed_by_its_parts(tiny_scene, capsys):
+    initialization_time.Command(data=tiny_scene, rounds=1).run()
+    rows = {row.split("`")[1]: float(row.split("|")[3]) for row in capsys.readouterr().out.splitlines()[2:]}
+    parts = ("change_points", "detect", "sample_points", "estimate", "initialize_from")
+    assert 0 < sum(rows[part] for part in parts) <= rows["learned_overlays"] + 0.05  # of rounding
+    assert rows["estimate_falloff"] + rows["estimate_layers"] <= rows["estimate"] + 0.02

@@ -56,6 +56,11 @@ def test_a_falloff_is_found_up_to_the_clearest_part_of_the_frame(wrong: float, s
     assert (found - (FALLOFF / clearest).clamp_max(1)).abs().max() < 0.04
 
 
+def test_samples_without_any_noise_have_no_falloff() -> None:
+    whole = samples(torch.ones(HEIGHT, WIDTH), wrong=0.0)
+    assert (estimate_falloff(replace(whole, color=torch.full_like(whole.color, 0.5))) == 1).all()
+
+
 def test_patches_count_not_the_points_own_colors() -> None:
     whole = samples(FALLOFF)
     nearer = replace(whole, color=whole.color * (1 + 0.5 * (X**2 + Y**2)).flatten()[whole.pixel, None])

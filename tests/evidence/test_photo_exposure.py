@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -31,6 +33,11 @@ def scene(spread: float, place: str = "photo", matte: float = 0.0, outliers: flo
         shown = torch.where(wrong, torch.rand(POINTS, 3, generator=generator), shown).clamp(0, 1)
         views.append(PointSamples(torch.arange(POINTS), pixel, shown, POINTS, SIZE, torch.zeros(POINTS).long()))
     return views, [layers] * VIEWS, log_gains
+
+
+def test_photos_without_any_noise_have_one_exposure():
+    samples, _, _ = scene(0.0)
+    assert (relative_gains([replace(each, color=torch.full_like(each.color, 0.5)) for each in samples]) == 0).all()
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.3])

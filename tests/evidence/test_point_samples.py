@@ -19,6 +19,8 @@ LARGE_K = torch.tensor([[600.0, 0.0, 480.0], [0.0, 600.0, 270.0], [0.0, 0.0, 1.0
 """Of a frame of 960 x 540 pixels, four to a working pixel."""
 K = torch.tensor([[40.0, 0.0, 30.0], [0.0, 40.0, 20.0], [0.0, 0.0, 1.0]])
 
+NEEDS_CUDA = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+
 
 def view(image: Tensor, x: float = 0.0, mask: Tensor | None = None) -> View:
     """A camera at (x, 0, 0) that looks along z."""
@@ -106,6 +108,42 @@ def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
     assert (samples.color[near] - samples.color[far]).min() > 0.3
     assert samples.patch is not None
     assert (samples.patch[near] - samples.patch[far]).abs().max() < 0.02
+
+
+def test_many_views_are_sampled_as_each_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where they are more than are projected at once, and photos of different types."""
+    monkeypatch.setattr(point_samples, "VIEWS_AT_ONCE", 2)
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(300, 3, generator=generator) * torch.tensor([4.0, 4.0, 3.0]) + torch.tensor([-2.0, -2.0, 1.0])
+    types = [torch.uint8, torch.float32, torch.uint16, torch.uint8, torch.float32]
+    views = [view(coordinates(dtype), x=0.3 * number) for number, dtype in enumerate(types)]
+    together = sample_points(points, views)
+    for number, each in enumerate(views):
+        alone, own = sample_points(points, [each]), together.view == number
+        assert 50 < len(alone.point) < 150  # some are hidden, and some beside the frame
+        assert together.point[own].tolist() == alone.point.tolist()
+        assert together.pixel[own].tolist() == alone.pixel.tolist()
+        torch.testing.assert_close(together.color[own], alone.color)
+
+
+def test_patches_belong_to_the_points_that_a_mask_leaves() -> None:
+    image = torch.where(torch.arange(60) < 30, 0.2, 0.8)[:, None].expand(40, 60, 3)
+    mask = (torch.arange(60) >= 30).expand(40, 60)
+    points = torch.tensor([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0], [0.5, 0.3, 2.0]])  # the mask hides the first
+    samples = sample_points(points, [View(image, mask, torch.eye(4), K)], UNKNOWN[:40, :60])
+    assert samples.point.tolist() == [1, 2]
+    torch.testing.assert_close(samples.patch, torch.full((2, 3), 0.8))
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NEEDS_CUDA)])
+def test_the_last_position_before_the_frames_edge_is_in_its_last_pixel(device: str) -> None:
+    """640 x 480 pixels, three to a working pixel: on a GPU 479.99997 / 3 is 160, as it multiplies by 1 / 3."""
+    last = torch.nextafter(torch.tensor([639.0, 480.0]), torch.zeros(2))  # 213 x 160 working pixels
+    points = torch.cat([last, torch.ones(1)])[None].to(device)
+    plain = View(torch.full((480, 640, 3), 0.5, device=device), None, torch.eye(4), torch.eye(3))
+    samples = sample_points(points, [plain])
+    assert samples.size == (160, 213)
+    assert samples.pixel.tolist() == [160 * 213 - 1]
 
 
 def test_samples_state_the_ratio_of_focal_lengths() -> None:
