@@ -60,6 +60,7 @@ def test_a_script_ends_as_a_command_does(arguments, code, said):
     assert len(done.stderr.splitlines()) == (1 if code else 0)
 
 
+@pytest.mark.slow
 def test_an_initialization_is_timed_by_its_parts(tiny_scene, capsys):
     initialization_time.Command(data=tiny_scene, rounds=1).run()
     rows = {row.split("`")[1]: float(row.split("|")[3]) for row in capsys.readouterr().out.splitlines()[2:]}
