@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
-from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE, OUTLIER_SCALE
+from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE, OUTLIER_SCALE, robust_deviation
 from ssa_nerfstudio.evidence.photo_exposure import DAMPING, ROUNDS, USABLE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
@@ -107,6 +107,5 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
         weighted = weight * centered
         solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
         rest -= centered @ solution
-        scale = OUTLIER_SCALE * (1.48 * rest.abs().median() + GRAY_LEVEL)
-        weight = 1 / (1 + (rest / scale).square())
+        weight = 1 / (1 + (rest / (OUTLIER_SCALE * robust_deviation(rest))).square())
     return solution.flatten()[: modes.shape[1]]

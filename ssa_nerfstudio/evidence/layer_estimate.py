@@ -108,7 +108,7 @@ def estimate_layers(
     seen_by = torch.bincount(point, minlength=samples.points)[point]
     uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
     for round_ in range(ROUNDS):
-        scale = 1.48 * residual.abs().median() + GRAY_LEVEL
+        scale = robust_deviation(residual)
         weight = 1 / (1 + residual.square().mean(dim=-1, keepdim=True) / (OUTLIER_SCALE * scale) ** 2)
         behind = colors[point]
         precision = weight / (scale**2 * (1 + uncertainty))
@@ -144,6 +144,11 @@ def estimate_layers(
     around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), OCCLUSION_RADIUS)
     unexplained = around[..., :1] / around[..., 1:].clamp_min(1e-9)
     return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained)
+
+
+def robust_deviation(residuals: Tensor) -> Tensor:
+    """Standard deviation of residuals, [], from the median of their lengths; at least that of rounded photos."""
+    return 1.48 * residuals.abs().median() + GRAY_LEVEL
 
 
 def _initial_residual(samples: PointSamples, clear: Tensor, constant: Tensor) -> Tensor:

@@ -8,9 +8,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE
+from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE, robust_deviation
 from ssa_nerfstudio.evidence.point_samples import PointSamples, View, regular_subset, sample_points
-from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 USABLE = (0.04, 0.96)
 """Values whose logarithm says something about exposure: above the noise of dark pixels, below clipping."""
@@ -102,8 +101,7 @@ def _regression(values: Tensor, certainty: Tensor) -> Tensor:
         rest = values - views[:, None]
         rest = rest - (share * rest).sum(dim=0)
         if usable.any():
-            scale = OUTLIER_SCALE * (1.48 * rest[usable].abs().median() + GRAY_LEVEL)
-            weight = certainty / (1 + (rest / scale).square())
+            weight = certainty / (1 + (rest / (OUTLIER_SCALE * robust_deviation(rest[usable]))).square())
     return (views - views.mean()).float()
 
 

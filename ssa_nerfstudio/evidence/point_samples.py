@@ -130,15 +130,15 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     footprint = (2 * OCCLUSION_RADIUS + 1) * farthest[seen.point] / seen.depth
     counts = torch.bincount(seen.view, minlength=len(views)).tolist()
     by_view = (each.split(counts) for each in (seen.pixel, seen.position, footprint))
-    colors, patches, unhidden = [], [], []
+    colors, patches, kept = [], [], []
     for view, pixel, position, side in zip(views, *by_view, strict=True):
-        image, unmasked, here = view.image[..., :3].to(points.device), None, torch.ones_like(pixel, dtype=torch.bool)
+        image, unmasked, inside = view.image[..., :3].to(points.device), None, torch.ones_like(pixel, dtype=torch.bool)
         if view.mask is not None:
             mask = view.mask.reshape(height, width, 1).to(points.device) != 0
             image, unmasked = torch.where(mask, image, 0), _boxes(mask, reduction)
-            here = unmasked[::reduction, ::reduction].flatten()[pixel] == 1
-            here &= _read(unmasked, position, reduction)[:, 0] > 1 - GRAY_LEVEL
-        unhidden.append(here)
+            inside = unmasked[::reduction, ::reduction].flatten()[pixel] == 1
+            inside &= _read(unmasked, position, reduction)[:, 0] > 1 - GRAY_LEVEL
+        kept.append(inside)
         boxes = _boxes(image, reduction)
         colors.append(_read(boxes, position, reduction))
         if guide is not None:
@@ -154,9 +154,9 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
         color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
         color = color.clamp_min(0).minimum(1 / gains[seen.view])
         patch = torch.cat(patches) / white[seen.view]
-    kept = torch.cat(unhidden)
-    point, pixel, color, shown_by = (each[kept] for each in (seen.point, seen.pixel, color, seen.view))
-    patch = None if patch is None else patch[kept]
+    shown = torch.cat(kept).nonzero()[:, 0]
+    point, pixel, color, shown_by = (each[shown] for each in (seen.point, seen.pixel, color, seen.view))
+    patch = None if patch is None else patch[shown]
     focal_lengths = torch.stack([view.intrinsics.diagonal()[:2] for view in views]).mean(dim=0)
     ratio = float(focal_lengths[0] / focal_lengths[1])
     return PointSamples(point, pixel, color, len(points), size, shown_by, patch, ratio).ordered()
@@ -252,7 +252,7 @@ def _visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[
     found = []
     for first in range(0, len(views), VIEWS_AT_ONCE):
         some = views[first : first + VIEWS_AT_ONCE]
-        poses, lenses = (torch.stack([getattr(v, name) for v in some]) for name in ("world_to_camera", "intrinsics"))
+        poses, lenses = torch.stack([v.world_to_camera for v in some]), torch.stack([v.intrinsics for v in some])
         view, point, position, depth = project(points, poses, lenses, height * reduction, width * reduction)
         x, y = (position / reduction).long().unbind(dim=-1)
         # A GPU multiplies by 1 / reduction, rounded, which may bring a position to the frame's edge.
