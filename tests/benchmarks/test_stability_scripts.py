@@ -39,6 +39,7 @@ def test_a_parameter_that_breaks_is_named_with_its_step(tiny_scene, tmp_path, mo
 
 
 @pytest.mark.parametrize("overlay", ["on", "off"])
+@pytest.mark.slow
 def test_the_cost_of_the_guards_is_printed_with_its_interval(tiny_scene, capsys, overlay):
     guard_cost.Command(data=tiny_scene, overlay=overlay, grow=20, pairs=4).run()
     line = capsys.readouterr().out.strip().splitlines()[-1]

@@ -12,6 +12,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence import layer_estimate
 
 
+@pytest.mark.slow
 def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_scene, tmp_path, capsys):
     clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
     main(["simulate", "--data", str(clean), "--output", str(tmp_path / "covered"), "--effects", "dashboard"])

@@ -87,9 +87,17 @@ def test_a_full_disk(blocks, tiny_scene, tmp_path):
 @pytest.mark.parametrize(
     ("words", "names"),
     [
-        ("export-overlay --load-config run/config.yml --output out --apply scene/images", "out"),
+        pytest.param(
+            "export-overlay --load-config run/config.yml --output out --apply scene/images",
+            "out",
+            marks=pytest.mark.slow,
+        ),
         ("export-splats --load-config run/config.yml --output-dir out", "out/splat.ply"),
-        ("export-dataset --load-config run/config.yml --data scene --for colmap --output out", "out"),
+        pytest.param(
+            "export-dataset --load-config run/config.yml --data scene --for colmap --output out",
+            "out",
+            marks=pytest.mark.slow,
+        ),
         ("simulate --data scene --effects dashboard --output out", "out"),
     ],
 )

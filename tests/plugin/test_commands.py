@@ -56,54 +56,39 @@ def call(monkeypatch):
 
 
 @pytest.fixture(scope="module")
-def config(tiny_scene, tmp_path_factory) -> Path:
-    """A run that was killed with SIGKILL after its first checkpoints and then resumed to its end."""
+def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
+    """`ns-train` that got ctrl+c after its first checkpoint."""
     output = tmp_path_factory.mktemp("runs")
-    options = ["--data", tiny_scene, "--output-dir", output, "--max-num-iterations", "250", "--steps-per-save", "20"]
-    process = subprocess.Popen(
-        [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "killed"],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        env=OFFLINE,
-    )
-    checkpoints = output / "dashboard" / "ssa-splatfacto" / "killed" / "nerfstudio_models"
+    options = ["--data", tiny_scene, "--output-dir", output, "--max-num-iterations", "20000", "--steps-per-save", "20"]
+    words = [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "stopped"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=OFFLINE)
+    checkpoints = output / "dashboard" / "ssa-splatfacto" / "stopped" / "nerfstudio_models"
     deadline = time.monotonic() + 240
     while not list(checkpoints.glob("step-*.ckpt")):
         assert process.poll() is None, "the training ended before it wrote a checkpoint"
         assert time.monotonic() < deadline, "no checkpoint was written"
         time.sleep(0.05)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    saved = max(int(path.stem.removeprefix("step-")) for path in checkpoints.glob("step-*.ckpt"))
-    assert saved < 249
-    command("ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "resumed", "--load-dir", checkpoints)
-    return checkpoints.parent.parent / "resumed" / "config.yml"
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=300)
+    return subprocess.CompletedProcess(words, process.returncode, out, err)
+
+
+@pytest.fixture(scope="module")
+def resumed(stopped) -> subprocess.CompletedProcess:
+    """The command that the stopped run ended with, to step 250."""
+    words = stopped.stderr.splitlines()[-1].partition(": ns-train ")[2]
+    return command("ns-train", *shlex.split(words), "--max-num-iterations", "250", "--timestamp", "resumed")
+
+
+@pytest.fixture(scope="module")
+def config(stopped, resumed) -> Path:
+    """The configuration of the run that was resumed to its end."""
+    output = Path(stopped.args[stopped.args.index("--output-dir") + 1])
+    return output / "dashboard" / "ssa-splatfacto" / "resumed" / "config.yml"
 
 
 def checkpoint(config: Path) -> dict:
     return torch.load(max((config.parent / "nerfstudio_models").glob("step-*.ckpt")))
-
-
-def test_a_killed_run_resumes_to_the_step_that_was_asked_for(config):
-    assert checkpoint(config)["step"] == 249
-
-
-@pytest.fixture(scope="module")
-def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
-    """`ns-train` that got ctrl+c after its first checkpoint."""
-    output = tmp_path_factory.mktemp("stopped")
-    options = ["--data", tiny_scene, "--output-dir", output, "--max-num-iterations", "20000", "--steps-per-save", "20"]
-    words = [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options]
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=OFFLINE)
-    deadline = time.monotonic() + 240
-    # Not `rglob`: it also finds the checkpoint that is still being written beside the folder.
-    while not list(output.glob("*/*/*/nerfstudio_models/step-*.ckpt")):
-        assert process.poll() is None
-        assert time.monotonic() < deadline
-        time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=300)
-    return subprocess.CompletedProcess(words, process.returncode, out, err)
 
 
 def test_ctrl_c_ends_a_training_in_one_line_with_the_command_that_resumes(stopped):
@@ -114,19 +99,22 @@ def test_ctrl_c_ends_a_training_in_one_line_with_the_command_that_resumes(stoppe
     assert re.match(r"ssa-nerfstudio: stopped: at step \d+; go on from step \d+: ns-train ssa-splatfacto ", line)
 
 
-def test_that_command_resumes_and_the_verdict_is_its_last_word(stopped):
-    start, words = re.split(r"go on from step (\d+): ", stopped.stderr.splitlines()[-1])[1:]
-    name, *options = shlex.split(words)
-    done = command(name, *options, "--max-num-iterations", str(int(start) + 30))
-    table, _, end = done.stdout.partition("Training Finished")
-    header = next(line for line in table.splitlines() if line.startswith("Step (% Done)"))
+def test_that_command_resumes_and_the_verdict_is_its_last_word(stopped, resumed):
+    start = int(re.search(r"go on from step (\d+): ", stopped.stderr.splitlines()[-1])[1])
+    table, _, end = resumed.stdout.partition("Training Finished")
+    header, *rows = [line for line in table.splitlines() if re.match(r"Step \(% Done\)|\d+ \(", line)]
     assert header.split("  ")[0] == "Step (% Done)"
     assert "Loss" in header
     assert "PSNR (dB)" in header
     assert "Rays" not in header
+    assert start < int(rows[0].split()[0]) <= start + 10
     assert re.match(r"Export it: ssa export-overlay --load-config \S+ --output artifact", end.splitlines()[-1])
     assert end.splitlines()[-2].startswith("Artifact: ")
     assert "profiling" not in end
+
+
+def test_a_resumed_run_goes_to_the_step_that_was_asked_for(config):
+    assert checkpoint(config)["step"] == 249
 
 
 def test_tensorboard_gets_the_artifact_as_pictures_and_figures(config):

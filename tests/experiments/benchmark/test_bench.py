@@ -89,6 +89,7 @@ def test_what_runs_at_the_time_limit_is_stopped_and_leaves_nothing(tmp_path):
     assert ssa("bench", "smoke", "--output", tmp_path, "--list").stdout.count("to do") == 5
 
 
+@pytest.mark.slow
 def test_a_run_that_failed_is_done_again(tmp_path):
     path = tmp_path / "short.yaml"
     path.write_text(SHORT)
@@ -106,6 +107,7 @@ def test_results_of_other_folders_are_taken_over(tmp_path, capsys):
     assert len(read_all([tmp_path / "here"])[0]) == 5
 
 
+@pytest.mark.slow
 def test_one_training_answers_for_every_name_it_goes_by(tmp_path, capsys):
     path = tmp_path / "twice.yaml"
     path.write_text(
@@ -248,6 +250,7 @@ def test_a_run_whose_request_is_removed_is_stopped(tmp_path):
     assert at_work(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_processes_end_with_an_interrupted_benchmark(tmp_path):
     def ended(run, result):
         raise KeyboardInterrupt

@@ -95,12 +95,14 @@ def test_view_dependent_color_is_reset_once(short):
     assert (rest[:, 0] == -0.5).all()  # clamped from above alone
 
 
+@pytest.mark.slow
 def test_it_removes_a_transient_distractor(gain, kept, baked):
     assert gain("robustnerf", "transient") > 0.7
     assert kept("robustnerf", "transient") < 0.1
     assert baked("robustnerf", "transient") < 0.3 * baked("3dgs", "transient")
 
 
+@pytest.mark.slow
 def test_it_learns_from_a_watermark(gain, kept, baked):
     assert gain("robustnerf", "watermark") < 0.5
     assert kept("robustnerf", "watermark") > 0.3
