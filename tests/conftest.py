@@ -24,11 +24,20 @@ import torch
 if TYPE_CHECKING:
     from ssa_nerfstudio.experiments.effects.layers import Layers
 
+FIRST = ("workflow/test_run.py", "plugin/test_commands.py", "plugin/test_browser.py")
+"""Modules whose tests share a training. An idle worker takes tests from the end of another's: in the middle, or at the
+end, it would train again."""
+
 torch.set_num_threads(1)
 # A shell's background jobs and nohup ignore them, and what a test starts would inherit that.
 for number in (signal.SIGINT, signal.SIGHUP):
     if signal.getsignal(number) is signal.SIG_IGN:
         signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put tests that share a training first."""
+    items.sort(key=lambda item: not item.path.as_posix().endswith(FIRST))
 
 
 @pytest.fixture(scope="session")

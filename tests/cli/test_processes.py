@@ -200,15 +200,14 @@ def test_errors_that_nobody_can_read(stream, tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
 
 
-def test_a_result_that_nobody_reads(tmp_path):
+def test_a_result_that_nobody_reads(tiny_scene, tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
-    config = write_run(tmp_path / "run", None)
-    words = ["export-splats", "--load-config", config, "--output-dir", tmp_path / "out"]
+    words = ["detect", "--data", tiny_scene, "--output", tmp_path / "out"]
     done = subprocess.run([*SSA, *words], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=300)
     os.close(writer)
     assert (done.returncode, "Traceback" in done.stderr) == (141, False)
-    assert (tmp_path / "out/splat.ply").is_file()
+    assert (tmp_path / "out").is_dir()
 
 
 @pytest.mark.parametrize(
@@ -249,7 +248,12 @@ def without_privileges() -> list[str]:
         ("scene/transforms.json", "detect --data scene --output out", "transforms.json cannot be read (Permission"),
         ("scene/images/train_0003.png", "detect --data scene --output out", "train_0003.png cannot be read"),
         ("run/nerfstudio_models", "export-splats --load-config run/config.yml --output-dir out", "run/nerfstudio_mod"),
-        ("run", "export-splats --load-config run/config.yml --output-dir out", "run/config.yml: Permission denied"),
+        pytest.param(
+            "run",
+            "export-splats --load-config run/config.yml --output-dir out",
+            "run/config.yml: Permission denied",
+            marks=pytest.mark.slow,
+        ),
         ("here", "detect --data scene --output here/out", "here/out"),
     ],
 )
