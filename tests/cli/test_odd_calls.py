@@ -56,11 +56,19 @@ def contents(folder: Path) -> dict[str, str]:
     return {str(path): hashlib.sha256(path.read_bytes()).hexdigest() for path in folder.rglob("*") if path.is_file()}
 
 
+def in_turn(cases: list[dict], readers: tuple[str, ...], kept: int) -> list:
+    """Each case for `kept` readers, which take turns, and for the others among the slow tests."""
+    return [
+        pytest.param(case, reader, id=f"{case['case']}-{reader}", marks=() if turn < kept else pytest.mark.slow)
+        for number, case in enumerate(cases)
+        for turn, reader in enumerate(readers[number % len(readers) :] + readers[: number % len(readers)])
+    ]
+
+
 READERS = ("detect", "simulate", "train", "export")
 
 
-@pytest.mark.parametrize("reader", READERS)
-@pytest.mark.parametrize("case", corpus("transforms"), ids=lambda case: case["case"])
+@pytest.mark.parametrize(("case", "reader"), in_turn(corpus("transforms"), READERS, 2))
 def test_an_odd_transforms_json(case, reader, readers, broken_scene, tmp_path, capsys):
     edit_json(broken_scene / "transforms.json", case)
     for name, content in case.get("beside", {}).items():
@@ -90,8 +98,7 @@ def test_an_odd_checkpoint(case, command, tmp_path, monkeypatch, capsys):
 PHOTO_READERS = (*READERS, "detect photos", "process", "export-overlay")
 
 
-@pytest.mark.parametrize("reader", PHOTO_READERS)
-@pytest.mark.parametrize("case", corpus("photos"), ids=lambda case: case["case"])
+@pytest.mark.parametrize(("case", "reader"), in_turn(corpus("photos"), PHOTO_READERS, 3))
 def test_an_odd_photo(case, reader, readers, broken_scene, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for path in (broken_scene / "images").glob("test_*"):
