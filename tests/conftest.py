@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from ssa_nerfstudio.experiments.effects.layers import Layers
 
 FIRST = ("workflow/test_run.py", "plugin/test_commands.py", "plugin/test_browser.py")
-"""Modules whose tests share a training. An idle worker takes tests from the end of another's: in the middle, or at the
-end, it would train again."""
+"""Modules whose tests share a long training. An idle worker takes tests from the end of another's: in the middle, or at
+the end, it would train again."""
 
 torch.set_num_threads(1)
 # A shell's background jobs and nohup ignore them, and what a test starts would inherit that.

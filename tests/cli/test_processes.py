@@ -207,7 +207,7 @@ def test_a_result_that_nobody_reads(tiny_scene, tmp_path):
     done = subprocess.run([*SSA, *words], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=300)
     os.close(writer)
     assert (done.returncode, "Traceback" in done.stderr) == (141, False)
-    assert (tmp_path / "out").is_dir()
+    assert any((tmp_path / "out").iterdir())
 
 
 @pytest.mark.parametrize(

@@ -73,9 +73,15 @@ def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
     return subprocess.CompletedProcess(words, process.returncode, out, err)
 
 
+def checkpoint_of(stopped: subprocess.CompletedProcess) -> int:
+    """The step that the last line of a stopped run says to go on from."""
+    return int(stopped.stderr.splitlines()[-1].partition("go on from step ")[2].partition(":")[0])
+
+
 @pytest.fixture(scope="module")
 def resumed(stopped) -> subprocess.CompletedProcess:
     """The command that the stopped run ended with, to step 250."""
+    assert checkpoint_of(stopped) < 200, "it was stopped too late"
     words = stopped.stderr.splitlines()[-1].partition(": ns-train ")[2]
     return command("ns-train", *shlex.split(words), "--max-num-iterations", "250", "--timestamp", "resumed")
 
@@ -100,7 +106,7 @@ def test_ctrl_c_ends_a_training_in_one_line_with_the_command_that_resumes(stoppe
 
 
 def test_that_command_resumes_and_the_verdict_is_its_last_word(stopped, resumed):
-    start = int(re.search(r"go on from step (\d+): ", stopped.stderr.splitlines()[-1])[1])
+    start = checkpoint_of(stopped)
     table, _, end = resumed.stdout.partition("Training Finished")
     header, *rows = [line for line in table.splitlines() if re.match(r"Step \(% Done\)|\d+ \(", line)]
     assert header.split("  ")[0] == "Step (% Done)"

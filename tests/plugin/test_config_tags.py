@@ -59,7 +59,6 @@ def test_what_cannot_be_parsed_is_left_to_the_reader(content, tmp_path):
     refuse_calls(tmp_path / "none.yml")
 
 
-@pytest.mark.slow
 def test_nerfstudios_commands_refuse_it_before_they_read_it(tmp_path):
     config = tmp_path / "config.yml"
     config.write_text("!!python/object/apply:os.system [touch RAN]")

@@ -7,7 +7,6 @@ import importlib.util
 import inspect
 import logging
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
@@ -26,10 +25,6 @@ from nerfstudio.utils import install_checks
 from ssa_nerfstudio.plugin.compat import gsplat_repairs, nerfstudio_repairs, open3d_libraries, versions
 
 
-def run(code: str) -> subprocess.CompletedProcess:
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-
-
 def test_numpy_scalars_in_checkpoints_need_to_be_allowed(tmp_path):
     path = tmp_path / "scalar.ckpt"
     torch.save({"lr": np.float64(0.5)}, path)
@@ -41,6 +36,7 @@ def test_numpy_scalars_in_checkpoints_need_to_be_allowed(tmp_path):
         nerfstudio_repairs.allow_checkpoint_scalars()
         assert torch.load(path, weights_only=True) == {"lr": 0.5}
     finally:
+        torch.serialization.clear_safe_globals()
         torch.serialization.add_safe_globals(allowed)
 
 
