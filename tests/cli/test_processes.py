@@ -92,7 +92,9 @@ def test_a_full_disk(blocks, tiny_scene, tmp_path):
             "out",
             marks=pytest.mark.slow,
         ),
-        ("export-splats --load-config run/config.yml --output-dir out", "out/splat.ply"),
+        pytest.param(
+            "export-splats --load-config run/config.yml --output-dir out", "out/splat.ply", marks=pytest.mark.slow
+        ),
         pytest.param(
             "export-dataset --load-config run/config.yml --data scene --for colmap --output out",
             "out",

@@ -232,7 +232,10 @@ def test_without_albumentations_the_extra_is_named(effect, monkeypatch):
         effect.layers(8, 8, rng())
 
 
-@pytest.mark.parametrize("effect", EFFECTS)
+@pytest.mark.parametrize(
+    "effect",
+    [name if name in ("dashboard", "rain") else pytest.param(name, marks=pytest.mark.slow) for name in EFFECTS],
+)
 def test_only_the_named_effect_is_loaded(effect):
     code = (
         "import sys; from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects\n"

@@ -31,6 +31,7 @@ def test_the_windscreen_dims_adds_and_has_the_gradients_of_that(reduction):
         torch.testing.assert_close(screen(clean, 1), expected)
 
 
+@pytest.mark.slow
 def test_it_finds_the_reflection_of_a_windscreen(capture, tmp_path):
     _, pipeline = train("dc-gaussian", capture("reflection"), tmp_path, STEPS)
     (screen,) = pipeline.model._windscreens()  # pyright: ignore
