@@ -3,7 +3,7 @@
 #   make demo DATA=PHOTOS      ssa run on your photos, video or dataset
 #   make docs                  the documentation as a site, in site/
 #   make test, make lint       what .ci/run runs, with make docs and make bare
-#   make slow                  the tests of ten seconds and more: whole trainings, structure from motion, real photos
+#   make slow                  the other tests: whole trainings, structure from motion, real photos, more readers of odd input
 #   make bare                  the product alone, without experiments, in an environment of its own (.venv-bare)
 #   make mutants ROOM=overlay  which changes of a folder its tests notice, all or SAMPLE=150 of them; ROOM=all: of every folder
 #   make stability             every hard case, the long ones too (docs/stability.md)

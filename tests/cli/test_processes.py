@@ -202,14 +202,15 @@ def test_errors_that_nobody_can_read(stream, tmp_path):
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
 
 
-def test_a_result_that_nobody_reads(tiny_scene, tmp_path):
+def test_a_result_that_nobody_reads(tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
-    words = ["detect", "--data", tiny_scene, "--output", tmp_path / "out"]
+    config = write_run(tmp_path / "run", None)
+    words = ["export-splats", "--load-config", config, "--output-dir", tmp_path / "out"]
     done = subprocess.run([*SSA, *words], stdout=writer, stderr=subprocess.PIPE, text=True, timeout=300)
     os.close(writer)
     assert (done.returncode, "Traceback" in done.stderr) == (141, False)
-    assert any((tmp_path / "out").iterdir())
+    assert (tmp_path / "out/splat.ply").is_file()
 
 
 @pytest.mark.parametrize(

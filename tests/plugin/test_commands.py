@@ -55,22 +55,30 @@ def call(monkeypatch):
     return run
 
 
-@pytest.fixture(scope="module")
-def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
-    """`ns-train` that got ctrl+c after its first checkpoint."""
-    output = tmp_path_factory.mktemp("runs")
-    options = ["--data", tiny_scene, "--output-dir", output, "--max-num-iterations", "20000", "--steps-per-save", "20"]
+def stopped_by(number: signal.Signals, data: Path, output: Path, steps: int) -> subprocess.CompletedProcess:
+    """`ns-train` that got a signal after its first checkpoint."""
+    options = ["--data", data, "--output-dir", output, "--max-num-iterations", str(steps), "--steps-per-save", "20"]
     words = [BIN / "ns-train", "ssa-splatfacto", *TRAIN, *options, "--timestamp", "stopped"]
     process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=OFFLINE)
-    checkpoints = output / "dashboard" / "ssa-splatfacto" / "stopped" / "nerfstudio_models"
+    checkpoints = models(output, "stopped")
     deadline = time.monotonic() + 240
     while not list(checkpoints.glob("step-*.ckpt")):
         assert process.poll() is None, "the training ended before it wrote a checkpoint"
         assert time.monotonic() < deadline, "no checkpoint was written"
         time.sleep(0.05)
-    process.send_signal(signal.SIGINT)
+    process.send_signal(number)
     out, err = process.communicate(timeout=300)
     return subprocess.CompletedProcess(words, process.returncode, out, err)
+
+
+def models(output: Path, timestamp: str) -> Path:
+    """The folder of a run's checkpoints."""
+    return output / "dashboard" / "ssa-splatfacto" / timestamp / "nerfstudio_models"
+
+
+@pytest.fixture(scope="module")
+def stopped(tiny_scene, tmp_path_factory) -> subprocess.CompletedProcess:
+    return stopped_by(signal.SIGINT, tiny_scene, tmp_path_factory.mktemp("runs"), 20000)
 
 
 def checkpoint_of(stopped: subprocess.CompletedProcess) -> int:
@@ -90,7 +98,7 @@ def resumed(stopped) -> subprocess.CompletedProcess:
 def config(stopped, resumed) -> Path:
     """The configuration of the run that was resumed to its end."""
     output = Path(stopped.args[stopped.args.index("--output-dir") + 1])
-    return output / "dashboard" / "ssa-splatfacto" / "resumed" / "config.yml"
+    return models(output, "resumed").parent / "config.yml"
 
 
 def checkpoint(config: Path) -> dict:
@@ -121,6 +129,17 @@ def test_that_command_resumes_and_the_verdict_is_its_last_word(stopped, resumed)
 
 def test_a_resumed_run_goes_to_the_step_that_was_asked_for(config):
     assert checkpoint(config)["step"] == 249
+
+
+@pytest.mark.slow
+def test_a_killed_run_resumes_to_the_step_that_was_asked_for(tiny_scene, tmp_path):
+    stopped_by(signal.SIGKILL, tiny_scene, tmp_path, 250)
+    checkpoints = models(tmp_path, "stopped")
+    saved = max(int(path.stem.removeprefix("step-")) for path in checkpoints.glob("step-*.ckpt"))
+    assert saved < 249
+    options = ["--data", tiny_scene, "--output-dir", tmp_path, "--max-num-iterations", "250", "--timestamp", "resumed"]
+    command("ns-train", "ssa-splatfacto", *TRAIN, *options, "--load-dir", checkpoints)
+    assert checkpoint(models(tmp_path, "resumed").parent / "config.yml")["step"] == 249
 
 
 def test_tensorboard_gets_the_artifact_as_pictures_and_figures(config):
