@@ -16,7 +16,7 @@ from torch.nn import Parameter
 from ssa_nerfstudio.overlay.compositing import clip_straight_through, composite
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.artifacts import Artifacts
-from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_lpips
+from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_torchmetrics
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_metrics
 from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
@@ -57,9 +57,9 @@ class SSASplatfactoModel(PhotoLosses):
         if points is not None:
             # Upstream moves seed colors to CUDA (splatfacto.py:261); without any it starts from random ones.
             self.seed_points = (points[0], points[1][:0])
-        with without_lpips():
+        with without_torchmetrics():
             super().populate_modules()
-        del self.lpips
+        del self.psnr, self.lpips
         self.seed_points = points
         nonfinite.replace_nonfinite_scales(self.scales.data)
         if points is not None and not self.config.random_init and len(points[1]):

@@ -6,13 +6,14 @@ import atexit
 import contextlib
 import os
 import shutil
+import sys
 import tempfile
+import types
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
-import torchmetrics.image.lpip
 from nerfstudio.utils import install_checks
 
 
@@ -56,20 +57,26 @@ def provide_ffmpeg() -> None:
 
 
 @contextlib.contextmanager
-def without_lpips() -> Iterator[None]:
-    """Build a splatfacto model without LPIPS, whose constructor downloads AlexNet's weights and fails offline.
+def without_torchmetrics() -> Iterator[None]:
+    """Build a splatfacto model with placeholders for its `psnr` and `lpips`, which no method of ours calls.
 
-    The model is built in the main thread before a viewer exists, so that the patch meets no other thread. May go when
-    splatfacto builds its metrics only where it evaluates.
+    The import of torchmetrics, in `SplatfactoModel.populate_modules`, takes a fifth of all imports, and LPIPS downloads
+    AlexNet's weights, which fails offline. The model is built in the main thread before a viewer exists, so that the
+    patch meets no other thread. May go when splatfacto builds its metrics only where it evaluates.
     """
-    original = torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity
 
-    class _NoLpips(torch.nn.Module):
+    class _Placeholder(torch.nn.Module):
         def __init__(self, **_) -> None:
             super().__init__()
 
-    torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = _NoLpips
+    modules = {name: types.ModuleType(name) for name in ("torchmetrics.image", "torchmetrics.image.lpip")}
+    for module in modules.values():
+        vars(module).update(PeakSignalNoiseRatio=_Placeholder, LearnedPerceptualImagePatchSimilarity=_Placeholder)
+    imported = {name: sys.modules[name] for name in modules if name in sys.modules}
+    sys.modules.update(modules)
     try:
         yield
     finally:
-        torchmetrics.image.lpip.LearnedPerceptualImagePatchSimilarity = original
+        for name in modules:
+            del sys.modules[name]
+        sys.modules.update(imported)

@@ -50,12 +50,25 @@ def test_splatfacto_builds_lpips_which_downloads_weights(monkeypatch):
         raise Built
 
     monkeypatch.setattr(torchmetrics.image.lpip, "LearnedPerceptualImagePatchSimilarity", build)
+    with pytest.raises(Built):
+        build_splatfacto()
+    with nerfstudio_repairs.without_torchmetrics():
+        build_splatfacto()
+    assert sys.modules["torchmetrics.image.lpip"].LearnedPerceptualImagePatchSimilarity is build
+
+
+def test_splatfacto_imports_torchmetrics_and_ours_does_not(monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "torchmetrics"]:
+        monkeypatch.delitem(sys.modules, name)
+    with nerfstudio_repairs.without_torchmetrics():
+        build_splatfacto()
+    assert not [name for name in sys.modules if name.split(".")[0] == "torchmetrics"]
+
+
+def build_splatfacto() -> None:
     box = SceneBox(aabb=torch.tensor([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
     config = SplatfactoModelConfig(random_init=True, num_random=8)
-    with pytest.raises(Built):
-        config.setup(scene_box=box, num_train_data=1, metadata={})
-    with nerfstudio_repairs.without_lpips():
-        config.setup(scene_box=box, num_train_data=1, metadata={})
+    config.setup(scene_box=box, num_train_data=1, metadata={})
 
 
 def test_nerfstudio_exits_without_an_ffmpeg_and_finds_the_one_that_is_provided(monkeypatch, tmp_path):
