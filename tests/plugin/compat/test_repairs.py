@@ -63,6 +63,9 @@ def test_splatfacto_imports_torchmetrics_and_ours_does_not(monkeypatch):
     with nerfstudio_repairs.without_torchmetrics():
         build_splatfacto()
     assert not [name for name in sys.modules if name.split(".")[0] == "torchmetrics"]
+    monkeypatch.setitem(sys.modules, "torchmetrics", None)
+    with pytest.raises(ImportError):
+        build_splatfacto()
 
 
 def build_splatfacto() -> None:
