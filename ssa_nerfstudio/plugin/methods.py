@@ -25,6 +25,7 @@ command_entry.check_config()
 versions.check_versions()
 open3d_libraries.preload()
 nerfstudio_repairs.allow_checkpoint_scalars()
+nerfstudio_repairs.list_external_methods_fast()
 former_names.provide_former_names()
 if command_entry.is_nerfstudio_command():
     nerfstudio_repairs.provide_ffmpeg()

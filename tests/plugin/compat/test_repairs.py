@@ -16,6 +16,7 @@ import pytest
 import torch
 from gsplat.cuda import _wrapper
 from gsplat.strategy import DefaultStrategy
+from nerfstudio.configs import external_methods
 from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 from nerfstudio.data.scene_box import SceneBox
 from nerfstudio.engine.trainer import Trainer
@@ -38,6 +39,19 @@ def test_numpy_scalars_in_checkpoints_need_to_be_allowed(tmp_path):
     finally:
         torch.serialization.clear_safe_globals()
         torch.serialization.add_safe_globals(allowed)
+
+
+def test_the_list_of_external_methods_reads_sources_and_the_repaired_one_lists_the_same_without(monkeypatch):
+    read = []
+    find = inspect.findsource
+    monkeypatch.setattr(inspect, "findsource", lambda frame: read.append(frame) or find(frame))
+    monkeypatch.setattr(external_methods, "inspect", inspect)
+    listed = external_methods.get_external_methods()
+    assert len(read) >= len(listed[0]) > 0
+    read.clear()
+    nerfstudio_repairs.list_external_methods_fast()
+    assert external_methods.get_external_methods() == listed
+    assert not read
 
 
 def test_splatfacto_builds_lpips_which_downloads_weights(monkeypatch):
