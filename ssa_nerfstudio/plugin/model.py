@@ -90,6 +90,11 @@ class SSASplatfactoModel(PhotoLosses):
             self.scene_scale = extent
             self.strategy_state = self.strategy.initialize_state(scene_scale=extent)
 
+    def set_budget(self, gaussians: int) -> None:
+        """Set MCMC's largest number of Gaussians; ADC has none."""
+        if isinstance(self.strategy, MarkovChainMonteCarlo):
+            self.strategy.cap_max = gaussians
+
     def k_nearest_sklearn(self, x: Tensor, k: int):
         """Distances to, and indices of, the k nearest neighbors of points [N, 3]; of fewer where N is too small.
 

@@ -26,6 +26,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, fisheye_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
+from ssa_nerfstudio.plugin.decisions import tell
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
 from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
@@ -34,6 +35,7 @@ from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelCo
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
+from ssa_nerfstudio.plugin.training.densification import gaussian_budget
 from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
 from ssa_nerfstudio.plugin.triton_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
@@ -96,6 +98,7 @@ class SSAPipeline(VanillaPipeline):
             positions = cameras.camera_to_worlds[:, :3, 3]
             self.model.set_scene_extent(_extent(positions))
             self.model.start_outside_cameras(positions)
+            self._set_budget(cameras)
             self._examine_photos()
             # After the photos are decoded: a size that they do not have is the dataset's fault.
             check_first_resolution(cameras, config.model.num_downscales)
@@ -122,9 +125,18 @@ class SSAPipeline(VanillaPipeline):
         self._set_near_plane()
         self.model.examine(self.datamanager)
 
+    def _set_budget(self, cameras: Cameras) -> None:
+        if self.config.model.strategy == "mcmc" and self.config.model.cap_max is None:
+            budget = gaussian_budget(int((cameras.width * cameras.height).sum()))
+            self.model.set_budget(budget)
+            tell(
+                f"Densification: MCMC with at most {budget:,} Gaussians. (--pipeline.model.cap-max states another "
+                "number, --pipeline.model.strategy adc finds one, in less time.)"
+            )
+
     def _set_near_plane(self) -> None:
         config, seeds, cameras = self.config.model, self.model.seed_points, self.datamanager.train_dataset.cameras
-        if config.strategy == "adc" and config.clearance and seeds is not None and len(seeds[0]):
+        if config.strategy != "mcmc" and config.clearance and seeds is not None and len(seeds[0]):
             size = int(cameras.width.max()), int(cameras.height.max())
             poses, Ks = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
             self.model.set_near_plane(nearest_depth(seeds[0], poses, Ks, *size))

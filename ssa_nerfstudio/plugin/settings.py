@@ -53,10 +53,11 @@ class ModelSettings(SplatfactoModelConfig):
     ignore_changing: bool = True
     """Where the estimate from points finds an artifact that changes from photo to photo, such as a weapon that sways,
     the photos teach the scene nothing; False: they do."""
-    strategy: Literal["adc", "mcmc"] = "adc"
-    """Densification: adc (adaptive density control, splatfacto's) or mcmc (fixed budget, cap_max)."""
-    cap_max: int = 1_000_000
-    """MCMC: the largest number of Gaussians."""
+    strategy: Literal["auto", "adc", "mcmc"] = "auto"
+    """Densification. adc: adaptive density control, splatfacto's; mcmc: up to a fixed number of Gaussians, cap_max;
+    auto: mcmc where at least 7,000 steps are trained, and adc in shorter trainings, where it is ahead."""
+    cap_max: int | None = None
+    """MCMC: the largest number of Gaussians; None: one for 150 pixels of the training photos, at most a million."""
     mcmc_stop_at: int = 25_000
     """MCMC: step after which Gaussians are no longer added or relocated."""
     mcmc_opacity_start: float = 0.5

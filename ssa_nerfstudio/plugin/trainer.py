@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import shlex
 from collections.abc import Iterator
@@ -35,7 +36,7 @@ from ssa_nerfstudio.plugin.training.checkpoints import (
 from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
-from ssa_nerfstudio.plugin.training.schedules import scaled
+from ssa_nerfstudio.plugin.training.schedules import densification, scaled
 from ssa_nerfstudio.plugin.validation import (
     check_checkpoint,
     check_device,
@@ -95,8 +96,9 @@ class SSATrainer(Trainer):
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         config.check()  # before schedules are rounded up
-        if config.scale_schedules:
-            config = scaled(config)
+        config = scaled(config) if config.scale_schedules else copy.deepcopy(config)
+        model = config.pipeline.model
+        model.strategy = densification(model.strategy, config.max_num_iterations)
         super().__init__(config, local_rank, world_size)
 
     def _resumed_checkpoint(self) -> Path | None:

@@ -194,7 +194,7 @@ def check_settings(model: ModelSettings, device: torch.device | str) -> None:
             "photo's colors",
             "choose one",
         )
-    if model.rasterizer == "reference" and model.use_absgrad and model.strategy == "adc":
+    if model.rasterizer == "reference" and model.use_absgrad and model.strategy != "mcmc":
         raise InputError(
             "--pipeline.model.rasterizer reference has no absgrad", "add --pipeline.model.use-absgrad False"
         )

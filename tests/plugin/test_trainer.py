@@ -25,6 +25,19 @@ def trainer(tmp_path, monkeypatch):
     return made
 
 
+@pytest.mark.parametrize("scale_schedules", [True, False])
+@pytest.mark.parametrize(("method", "expected"), [("ssa-splatfacto", "mcmc"), ("ssa-splatfacto-fast", "adc")])
+def test_the_trainer_settles_the_densification_by_the_length_and_changes_no_configuration(
+    method, expected, scale_schedules, tiny_scene, tmp_path
+):
+    config = copy.deepcopy(METHODS[method])
+    config.data, config.output_dir, config.scale_schedules = tiny_scene, tmp_path, scale_schedules
+    config.set_timestamp()
+    before = copy.deepcopy(config)
+    assert SSATrainer(config).config.pipeline.model.strategy == expected
+    assert config == before
+
+
 def test_ctrl_c_says_from_which_step_the_training_goes_on(trainer, tmp_path):
     for step in (10, 20):
         (tmp_path / f"step-{step:09d}.ckpt").touch()

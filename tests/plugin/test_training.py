@@ -17,6 +17,7 @@ from PIL import Image
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.methods import METHODS
+from ssa_nerfstudio.plugin.training.densification import gaussian_budget
 from ssa_nerfstudio.plugin.training.schedules import scaled
 
 
@@ -263,6 +264,18 @@ def test_a_free_viewpoint_of_any_aspect_shows_the_overlay_unstretched(trained):
     assert drawn["overlay_alpha"].shape == (48, 200, 1)
     assert drawn["overlay_alpha"][:, :68].max() == 0
     assert drawn["overlay_alpha"][-4:, 70:130].mean() > 0.9
+
+
+def test_mcmc_has_a_gaussian_for_150_pixels_of_the_photos_unless_a_number_is_stated(tiny_scene, tmp_path, run):
+    _, pipeline, _ = run(tiny_scene, tmp_path / "photos", 2, strategy="mcmc")
+    assert pipeline.model.strategy.cap_max == round(12 * 64 * 48 / 150) == 246
+    _, pipeline, _ = run(tiny_scene, tmp_path / "stated", 2, strategy="mcmc", cap_max=999)
+    assert pipeline.model.strategy.cap_max == 999
+
+
+@pytest.mark.parametrize(("pixels", "expected"), [(1, 1), (1_500, 10), (149_999_999, 1_000_000), (10**10, 1_000_000)])
+def test_the_budget_of_gaussians_is_at_least_one_and_at_most_a_million(pixels, expected):
+    assert gaussian_budget(pixels) == expected
 
 
 def test_every_schedule_is_scaled_with_the_length_of_the_run():

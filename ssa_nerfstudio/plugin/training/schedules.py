@@ -1,9 +1,9 @@
-"""Scales schedules, which all assume 30,000 steps, to the length of a run."""
+"""Fits settings to the length of a run: schedules, which all assume 30,000 steps, and the densification."""
 
 from __future__ import annotations
 
 import copy
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from nerfstudio.engine.trainer import TrainerConfig
 
@@ -15,6 +15,8 @@ DEFAULT_LENGTH = 15_000
 """Steps of a training with a GPU: between 7000, which small captures need, and splatfacto's 30,000 (docs/cost.md)."""
 FAST_LENGTH = 4_000
 """The shortest length that was within half a decibel of 7000 steps on every capture (docs/cost.md)."""
+MCMC_LENGTH = 7_000
+"""The shortest length at which MCMC is as good as ADC, or better, on every capture (docs/cost.md)."""
 MIN_REFINE_EVERY = 10
 """Lower bound of the steps between two refinements, whose statistics need a few views."""
 MIN_STEPS_PER_IMAGE = 100
@@ -34,6 +36,11 @@ MODEL_STEPS = (
     "mcmc_stop_at",
 )
 """Settings of the model that count steps and are scaled; 0 switches one off."""
+
+
+def densification(strategy: str, steps: int) -> Literal["adc", "mcmc"]:
+    """The densification of a training of so many steps, by the model's setting `strategy`."""
+    return "mcmc" if strategy == "mcmc" or (strategy == "auto" and steps >= MCMC_LENGTH) else "adc"
 
 
 def scaled(config: Config) -> Config:

@@ -7,7 +7,7 @@ import copy
 import pytest
 
 from ssa_nerfstudio.plugin.methods import METHODS
-from ssa_nerfstudio.plugin.training.schedules import MODEL_STEPS, scaled
+from ssa_nerfstudio.plugin.training.schedules import MODEL_STEPS, densification, scaled
 
 every_method = pytest.mark.parametrize("method", METHODS)
 
@@ -61,6 +61,13 @@ def test_refinements_of_a_run_of_a_few_steps_are_ten_steps_apart():
 
 def test_a_run_of_no_steps_is_scaled_too():
     assert scaled(of_length("ssa-splatfacto", 0)).optimizers["overlay"]["optimizer"].lr == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize(("steps", "expected"), [(1, "adc"), (6_999, "adc"), (7_000, "mcmc"), (30_000, "mcmc")])
+def test_a_training_long_enough_for_mcmc_has_it_unless_another_is_stated(steps, expected):
+    assert densification("auto", steps) == expected
+    assert densification("adc", steps) == "adc"
+    assert densification("mcmc", steps) == "mcmc"
 
 
 def test_settings_of_a_subclass_that_count_steps_follow_as_well():

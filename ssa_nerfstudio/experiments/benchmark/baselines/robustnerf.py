@@ -107,7 +107,7 @@ class RobustModel(BaselineModel):
 
     def step_post_backward(self, step: int) -> None:
         """Densify as splatfacto does, without what is unused, then reset view-dependent color once."""
-        if self.config.prune_unused and self.config.strategy == "adc":
+        if self.config.prune_unused and self.config.strategy != "mcmc":
             self._mark_unused(step)
         super().step_post_backward(step)
         if step and step == self.config.specular_reset_at:
