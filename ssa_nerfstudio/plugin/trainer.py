@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import logging
 import shlex
 from collections.abc import Iterator
@@ -36,7 +35,7 @@ from ssa_nerfstudio.plugin.training.checkpoints import (
 from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
-from ssa_nerfstudio.plugin.training.schedules import densification, scaled
+from ssa_nerfstudio.plugin.training.schedules import fitted
 from ssa_nerfstudio.plugin.validation import (
     check_checkpoint,
     check_device,
@@ -96,9 +95,7 @@ class SSATrainer(Trainer):
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         config.check()  # before schedules are rounded up
-        config = scaled(config) if config.scale_schedules else copy.deepcopy(config)
-        model = config.pipeline.model
-        model.strategy = densification(model.strategy, config.max_num_iterations)
+        config = fitted(config, config.scale_schedules)
         super().__init__(config, local_rank, world_size)
 
     def _resumed_checkpoint(self) -> Path | None:

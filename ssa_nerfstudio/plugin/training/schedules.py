@@ -43,6 +43,14 @@ def densification(strategy: str, steps: int) -> Literal["adc", "mcmc"]:
     return "mcmc" if strategy == "mcmc" or (strategy == "auto" and steps >= MCMC_LENGTH) else "adc"
 
 
+def fitted(config: Config, scale_schedules: bool) -> Config:
+    """Copy a run's configuration with the densification settled and, where asked for, `scaled` schedules."""
+    config = scaled(config) if scale_schedules else copy.deepcopy(config)
+    model: Any = config.pipeline.model
+    model.strategy = densification(model.strategy, config.max_num_iterations)
+    return config
+
+
 def scaled(config: Config) -> Config:
     """Copy a run's configuration with every schedule scaled by its number of steps / 30000.
 
