@@ -78,6 +78,7 @@ class Command:
 
     def _training(self, output: Path) -> Training:
         model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": self.grow, "mcmc_stop_at": self.grow}
+        model["strategy"] = "mcmc" if self.method.endswith("mcmc") else "adc"
         steps = self.grow + self.pairs * CHECK_EVERY
         config = configure(self.method, self.data, output, steps, model, self.scale_factor)
         config.scale_schedules = False

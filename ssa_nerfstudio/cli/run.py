@@ -52,7 +52,7 @@ class Command:
     method: Literal["ssa-splatfacto", "ssa-splatfacto-fast", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"] = (
         "ssa-splatfacto"
     )
-    """What to train; -fast: ssa-splatfacto in fewer steps, with ADC in place of MCMC."""
+    """What to train; -fast: ssa-splatfacto in fewer steps, with ADC in place of MCMC, as without a GPU."""
     steps: int | None = None
     """Training steps; schedules are scaled to them. Default: 15000 with a GPU (4000 for -fast, 30000 for -paper),
     2000 without."""

@@ -50,6 +50,8 @@ class SSASplatfactoModel(PhotoLosses):
     strategy: AdaptiveDensityControl | MarkovChainMonteCarlo
     near_plane: Tensor
     """Depth (world units) below which cameras draw nothing."""
+    by_mcmc: Tensor
+    """bool: whether the densification is MCMC, for who resumes from the checkpoint."""
 
     def populate_modules(self) -> None:
         """Build splatfacto's Gaussians without CUDA and without downloads, then overlays and strategy."""
@@ -70,6 +72,7 @@ class SSASplatfactoModel(PhotoLosses):
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
+        self.register_buffer("by_mcmc", torch.tensor(self.config.strategy == "mcmc"))
         self._near_plane = NEAR_PLANE
         self.metrics_every = 10
         self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
@@ -142,6 +145,9 @@ class SSASplatfactoModel(PhotoLosses):
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         fit_checkpoint(self.exposure, dict, "exposure.")
         dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored
+        if self.config.strategy == "mcmc":
+            dict["near_plane"] = torch.tensor(NEAR_PLANE)  # of an ADC that MCMC goes on from
+        dict["by_mcmc"] = self.by_mcmc
         loaded = super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
         self._near_plane = float(self.near_plane)
         return loaded

@@ -98,7 +98,6 @@ class SSAPipeline(VanillaPipeline):
             positions = cameras.camera_to_worlds[:, :3, 3]
             self.model.set_scene_extent(_extent(positions))
             self.model.start_outside_cameras(positions)
-            self._set_budget(cameras)
             self._examine_photos()
             # After the photos are decoded: a size that they do not have is the dataset's fault.
             check_first_resolution(cameras, config.model.num_downscales)
@@ -123,15 +122,18 @@ class SSAPipeline(VanillaPipeline):
             by_photos = self.config.model.exposure_place == "auto"
             start_beside_artifact(self.model.exposure, self.model.artifacts, samples, by_photos)
         self._set_near_plane()
+        self._set_budget()
         self.model.examine(self.datamanager)
 
-    def _set_budget(self, cameras: Cameras) -> None:
-        if self.config.model.strategy == "mcmc" and self.config.model.cap_max is None:
-            budget = gaussian_budget(int((cameras.width * cameras.height).sum()))
+    def _set_budget(self) -> None:
+        config, cameras = self.config.model, self.datamanager.train_dataset.cameras
+        if config.strategy == "mcmc":
+            pixels, seeds = int((cameras.width * cameras.height).sum()), self.model.num_points
+            budget = config.cap_max or gaussian_budget(pixels, seeds)
             self.model.set_budget(budget)
             tell(
-                f"Densification: MCMC with at most {budget:,} Gaussians. (--pipeline.model.cap-max states another "
-                "number, --pipeline.model.strategy adc finds one, in less time.)"
+                f"Densification: MCMC with at most {max(budget, seeds):,} Gaussians. (--pipeline.model.cap-max states "
+                "another number, --pipeline.model.strategy adc finds one, in less time.)"
             )
 
     def _set_near_plane(self) -> None:

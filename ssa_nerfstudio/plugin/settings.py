@@ -55,9 +55,11 @@ class ModelSettings(SplatfactoModelConfig):
     the photos teach the scene nothing; False: they do."""
     strategy: Literal["auto", "adc", "mcmc"] = "auto"
     """Densification. adc: adaptive density control, splatfacto's; mcmc: up to a fixed number of Gaussians, cap_max;
-    auto: mcmc where at least 7,000 steps are trained, and adc in shorter trainings, where it is ahead."""
+    auto: mcmc where at least 7,000 steps are trained, adc in shorter trainings, where it is mostly ahead; a resumed run
+    keeps its own."""
     cap_max: int | None = None
-    """MCMC: the largest number of Gaussians; None: one for 150 pixels of the training photos, at most a million."""
+    """MCMC: the largest number of Gaussians; None: one for 150 pixels of the training photos, at most a million;
+    seed points are kept in any case."""
     mcmc_stop_at: int = 25_000
     """MCMC: step after which Gaussians are no longer added or relocated."""
     mcmc_opacity_start: float = 0.5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import shlex
 from collections.abc import Iterator
@@ -32,10 +33,10 @@ from ssa_nerfstudio.plugin.training.checkpoints import (
     staged_checkpoints,
     step_of,
 )
-from ssa_nerfstudio.plugin.training.event_writers import thin_event_writers
+from ssa_nerfstudio.plugin.training.event_writers import gradient_norms, thin_event_writers
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
-from ssa_nerfstudio.plugin.training.schedules import fitted
+from ssa_nerfstudio.plugin.training.schedules import densification, scaled
 from ssa_nerfstudio.plugin.validation import (
     check_checkpoint,
     check_device,
@@ -78,7 +79,7 @@ class SSATrainerConfig(TrainerConfig):
         check_machine(self.machine)
         check_port(self.viewer.websocket_port)
         check_device(self.machine.device_type)
-        check_settings(self.pipeline.model, self.machine.device_type)
+        check_settings(self.pipeline.model, self.machine.device_type, self.max_num_iterations)
         check_length(self.max_num_iterations, self.pipeline.datamanager.camera_res_scale_factor)
         check_intervals(self)
         check_optimizers(self.optimizers)
@@ -95,7 +96,7 @@ class SSATrainer(Trainer):
 
     def __init__(self, config: SSATrainerConfig, local_rank: int = 0, world_size: int = 1) -> None:
         config.check()  # before schedules are rounded up
-        config = fitted(config, config.scale_schedules)
+        config = scaled(config) if config.scale_schedules else copy.deepcopy(config)
         super().__init__(config, local_rank, world_size)
 
     def _resumed_checkpoint(self) -> Path | None:
@@ -129,7 +130,9 @@ class SSATrainer(Trainer):
 
         The overlays of a resumed run are allocated here, before the optimizers are built.
         """
-        self.config.pipeline.artifacts_of = self._resumed_checkpoint()
+        self.config.pipeline.artifacts_of = checkpoint = self._resumed_checkpoint()
+        model, resumed = self.config.pipeline.model, checkpoint and load_pipeline_state(checkpoint)
+        model.strategy = densification(model.strategy, self.config.max_num_iterations, resumed)
         with self._stopped_in_one_line():
             try:
                 super().setup(test_mode)
@@ -240,7 +243,7 @@ class SSATrainer(Trainer):
         due = [name for name in optimizers.parameters if step % every[name] == every[name] - 1]
         optimizers.step_groups(due, loss, self.grad_scaler)
         if self.config.log_gradients:
-            metrics |= _gradient_norms(self.pipeline.model)
+            metrics |= gradient_norms(self.pipeline.model)
         scale = self.grad_scaler.get_scale()
         self.grad_scaler.update()
         if scale <= self.grad_scaler.get_scale():  # a scaler that is lowered has skipped the step
@@ -285,12 +288,6 @@ class SSATrainer(Trainer):
             raise TrainingStopped(
                 f"at step {self.step}", f"go on from step {step_of(saved[0])}: {resuming(self.checkpoint_dir)}"
             ) from None
-
-
-def _gradient_norms(model: torch.nn.Module) -> dict[str, torch.Tensor]:
-    """2-norm of every parameter's gradient, and their sum, under nerfstudio's names."""
-    norms = {f"Gradients/{name}": p.grad.norm() for name, p in model.named_parameters() if p.grad is not None}
-    return {**norms, "Gradients/Total": reduce(torch.add, norms.values())}
 
 
 def machine() -> MachineConfig:

@@ -20,6 +20,7 @@ from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.data.training_requirements import MIN_VIEWS
 from ssa_nerfstudio.data.writing import is_text
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.plugin.training.schedules import densification
 
 if TYPE_CHECKING:
     from nerfstudio.engine.trainer import TrainerConfig
@@ -169,8 +170,8 @@ def check_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoi
         )
 
 
-def check_settings(model: ModelSettings, device: torch.device | str) -> None:
-    """Refuse settings of the model that contradict each other or the machine."""
+def check_settings(model: ModelSettings, device: torch.device | str, steps: int = 0) -> None:
+    """Refuse settings of the model that contradict each other or the machine; for a training of so many steps."""
     for name, lowest in _LOWEST.items():
         value = getattr(model, name)
         if value is not None and not lowest <= value < math.inf:
@@ -194,7 +195,7 @@ def check_settings(model: ModelSettings, device: torch.device | str) -> None:
             "photo's colors",
             "choose one",
         )
-    if model.rasterizer == "reference" and model.use_absgrad and model.strategy != "mcmc":
+    if model.rasterizer == "reference" and model.use_absgrad and densification(model.strategy, steps) == "adc":
         raise InputError(
             "--pipeline.model.rasterizer reference has no absgrad", "add --pipeline.model.use-absgrad False"
         )

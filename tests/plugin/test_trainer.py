@@ -12,6 +12,7 @@ from ssa_nerfstudio.errors import TrainingStopped
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.trainer import SSATrainer
+from ssa_nerfstudio.plugin.training.densification import MarkovChainMonteCarlo
 
 
 @pytest.fixture
@@ -25,16 +26,22 @@ def trainer(tmp_path, monkeypatch):
     return made
 
 
-@pytest.mark.parametrize("scale_schedules", [True, False])
-@pytest.mark.parametrize(("method", "expected"), [("ssa-splatfacto", "mcmc"), ("ssa-splatfacto-fast", "adc")])
+@pytest.mark.parametrize(
+    ("steps", "scale_schedules", "expected"), [(7_000, True, "mcmc"), (7_000, False, "mcmc"), (6_999, True, "adc")]
+)
 def test_the_trainer_settles_the_densification_by_the_length_and_changes_no_configuration(
-    method, expected, scale_schedules, tiny_scene, tmp_path
+    steps, scale_schedules, expected, tiny_scene, tmp_path, configure_training, capsys
 ):
-    config = copy.deepcopy(METHODS[method])
-    config.data, config.output_dir, config.scale_schedules = tiny_scene, tmp_path, scale_schedules
+    model = {"overlay": "off", "num_downscales": 0}
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, steps, model)
+    config.scale_schedules = scale_schedules
     config.set_timestamp()
     before = copy.deepcopy(config)
-    assert SSATrainer(config).config.pipeline.model.strategy == expected
+    trainer = SSATrainer(config)
+    trainer.setup()
+    assert trainer.pipeline.model.config.strategy == expected
+    assert bool(trainer.pipeline.model.by_mcmc) == isinstance(trainer.pipeline.model.strategy, MarkovChainMonteCarlo)
+    assert ("Densification: MCMC with at most" in capsys.readouterr().out) == (expected == "mcmc")
     assert config == before
 
 

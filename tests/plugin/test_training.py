@@ -17,8 +17,9 @@ from PIL import Image
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.methods import METHODS
-from ssa_nerfstudio.plugin.training.densification import gaussian_budget
+from ssa_nerfstudio.plugin.training.densification import MarkovChainMonteCarlo, gaussian_budget
 from ssa_nerfstudio.plugin.training.schedules import scaled
+from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 
 @pytest.fixture(scope="session")
@@ -267,15 +268,40 @@ def test_a_free_viewpoint_of_any_aspect_shows_the_overlay_unstretched(trained):
 
 
 def test_mcmc_has_a_gaussian_for_150_pixels_of_the_photos_unless_a_number_is_stated(tiny_scene, tmp_path, run):
-    _, pipeline, _ = run(tiny_scene, tmp_path / "photos", 2, strategy="mcmc")
+    few = {"strategy": "mcmc", "random_init": True, "num_random": 100}
+    _, pipeline, _ = run(tiny_scene, tmp_path / "photos", 2, **few)
     assert pipeline.model.strategy.cap_max == round(12 * 64 * 48 / 150) == 246
     _, pipeline, _ = run(tiny_scene, tmp_path / "stated", 2, strategy="mcmc", cap_max=999)
     assert pipeline.model.strategy.cap_max == 999
 
 
-@pytest.mark.parametrize(("pixels", "expected"), [(1, 1), (1_500, 10), (149_999_999, 1_000_000), (10**10, 1_000_000)])
-def test_the_budget_of_gaussians_is_at_least_one_and_at_most_a_million(pixels, expected):
-    assert gaussian_budget(pixels) == expected
+@pytest.mark.parametrize(
+    ("pixels", "seeds", "expected"),
+    [(1_500, 4, 10), (1_500, 20, 20), (10**10, 9, 1_000_000), (10**10, 1_000_001, 1_000_001)],
+)
+def test_the_budget_of_gaussians_holds_the_seeds_and_else_at_most_a_million(pixels, seeds, expected):
+    assert gaussian_budget(pixels, seeds) == expected
+
+
+def test_a_resumed_run_keeps_mcmc_however_short_the_rest_is(
+    tiny_scene, tmp_path, run, configure_training, train_and_evaluate
+):
+    _, _, path = run(tiny_scene, tmp_path, 4, strategy="mcmc", overlay="off")
+    longer = {"num_downscales": 0, "overlay": "off"}
+    resumed = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 6, longer)
+    resumed.load_dir = path.parent / "nerfstudio_models"
+    _, pipeline, _ = train_and_evaluate(resumed)
+    assert isinstance(pipeline.model.strategy, MarkovChainMonteCarlo)
+
+
+def test_mcmc_that_goes_on_from_adc_has_no_clearance(tiny_scene, tmp_path, run, configure_training, train_and_evaluate):
+    _, first, path = run(tiny_scene, tmp_path, 4, strategy="adc", overlay="off")
+    assert float(first.model.near_plane) > NEAR_PLANE
+    other = {"num_downscales": 0, "overlay": "off", "strategy": "mcmc"}
+    resumed = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 6, other)
+    resumed.load_dir = path.parent / "nerfstudio_models"
+    _, pipeline, _ = train_and_evaluate(resumed)
+    assert float(pipeline.model.near_plane) == pytest.approx(NEAR_PLANE)
 
 
 def test_every_schedule_is_scaled_with_the_length_of_the_run():

@@ -28,9 +28,9 @@ MAX_GAUSSIANS = 1_000_000
 """MCMC's largest number of Gaussians unless the settings state one: nerfstudio's and gsplat's."""
 
 
-def gaussian_budget(pixels: int) -> int:
-    """MCMC's largest number of Gaussians for training photos of so many pixels altogether."""
-    return max(1, min(MAX_GAUSSIANS, round(pixels / PIXELS_PER_GAUSSIAN)))
+def gaussian_budget(pixels: int, seeds: int) -> int:
+    """MCMC's largest number of Gaussians for photos of so many pixels altogether: none of the seeds is taken away."""
+    return max(seeds, min(MAX_GAUSSIANS, round(pixels / PIXELS_PER_GAUSSIAN)))
 
 
 def make_strategy(

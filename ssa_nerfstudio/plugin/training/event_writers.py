@@ -1,9 +1,11 @@
-"""Thins what nerfstudio writes to tensorboard and the like at every step."""
+"""What is written to tensorboard and the like: less than nerfstudio writes at every step, and norms of gradients."""
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any
 
+import torch
 from nerfstudio.utils import writer
 from nerfstudio.utils.writer import EventName
 
@@ -42,3 +44,9 @@ def thin_event_writers(every: int) -> None:
         each if isinstance(each, writer.LocalWriter) else ThinnedWriter(each, max(1, every))
         for each in writer.EVENT_WRITERS
     ]
+
+
+def gradient_norms(model: torch.nn.Module) -> dict[str, torch.Tensor]:
+    """2-norm of every parameter's gradient, and their sum, under nerfstudio's names."""
+    norms = {f"Gradients/{name}": p.grad.norm() for name, p in model.named_parameters() if p.grad is not None}
+    return {**norms, "Gradients/Total": reduce(torch.add, norms.values())}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 
 import pytest
+import torch
 
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.training.schedules import MODEL_STEPS, densification, scaled
@@ -68,6 +69,20 @@ def test_a_training_long_enough_for_mcmc_has_it_unless_another_is_stated(steps, 
     assert densification("auto", steps) == expected
     assert densification("adc", steps) == "adc"
     assert densification("mcmc", steps) == "mcmc"
+
+
+def test_a_resumed_training_keeps_its_densification_unless_another_is_stated():
+    for steps in (10, 30_000):
+        assert densification("auto", steps, {"_model.by_mcmc": torch.tensor(True)}) == "mcmc"
+        assert densification("auto", steps, {"_model.by_mcmc": torch.tensor(False)}) == "adc"
+        assert densification("auto", steps, {}) == "adc", "a checkpoint of before"
+        assert densification("mcmc", steps, {"_model.by_mcmc": torch.tensor(False)}) == "mcmc"
+
+
+@pytest.mark.parametrize(("method", "expected"), zip(METHODS, ("mcmc", "adc", "mcmc", "adc"), strict=True))
+def test_the_densification_of_the_methods_as_they_ship(method, expected):
+    config = METHODS[method]
+    assert densification(config.pipeline.model.strategy, config.max_num_iterations) == expected
 
 
 def test_settings_of_a_subclass_that_count_steps_follow_as_well():
