@@ -245,10 +245,11 @@ class SSASplatfactoModel(PhotoLosses):
 
     def get_loss_dict(self, outputs: dict, batch: dict, metrics_dict: dict | None = None) -> dict[str, Tensor]:
         """The paper's loss: photometric on the composite, sparsity of the matte, and the strategy's own terms."""
-        losses = self._recorded_losses(outputs, batch) if "render" in outputs else self._photo_losses(outputs, batch)
+        recorded = "render" in outputs
+        losses = self._recorded_losses(outputs, batch) if recorded else self._photo_losses(outputs, batch)
         if not self.training:
             return losses
-        losses |= regularizers(self.config, self.scales, self.opacities, self.step)
+        losses |= regularizers(self.config, self.scales, self.opacities, self.step, by_hand=recorded)
         self.camera_optimizer.get_loss_dict(losses)
         if self.config.use_bilateral_grid:
             losses["tv_loss"] = 10 * total_variation_loss(self.bil_grids.grids)

@@ -150,8 +150,8 @@ class MarkovChainMonteCarlo(MCMCStrategy):
         if due and self.refine_start_iter < step < self.refine_stop_iter:
             binoms = state["binoms"] = state["binoms"].to(params["means"].device)
             self._relocate_gs(params, optimizers, binoms)
-            self._add_new_gs(params, optimizers, binoms)
-            torch.cuda.empty_cache()
+            if self._add_new_gs(params, optimizers, binoms):
+                torch.cuda.empty_cache()  # of blocks of the former sizes; to allocate the same again takes time
         lr = optimizers["means"].param_groups[0]["lr"]
         perturb(params, lr * self.noise_lr, info.get("taken"))
 

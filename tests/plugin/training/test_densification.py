@@ -203,6 +203,22 @@ def test_mcmc_moves_the_dead_adds_up_to_its_cap_and_perturbs():
     assert all(optimizers[name].state[params[name]]["exp_avg"].shape == params[name].shape for name in params)
 
 
+def test_mcmc_keeps_the_allocators_memory_where_it_adds_nothing(monkeypatch):
+    """Relocation takes place where the Gaussians are."""
+    emptied = []
+    monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(len(params["means"])))
+    params, optimizers = gaussians(60)
+    strategy = MarkovChainMonteCarlo(refine_start_iter=0, refine_every=1, cap_max=65)
+    state = strategy.initialize_state()
+    places = []
+    for step in range(1, 6):
+        params["opacities"].data[:5] = -9.0
+        strategy.step_post_backward(params, optimizers, state, step, {})
+        places.append([parameter.data_ptr() for parameter in params.values()])
+    assert emptied == [63, 65]
+    assert places[1] == places[-1]
+
+
 def test_mcmc_relocates_adds_and_perturbs_as_gsplats_does():
     results = []
     for kind in (MarkovChainMonteCarlo, MCMCStrategy):
