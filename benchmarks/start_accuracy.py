@@ -54,6 +54,7 @@ ESTIMATE = {
     "expected_layers": ("DETAIL_RADIUS",),
     "layer_estimate": (
         "ROUNDS",
+        "COLOR_ROUNDS",
         "CONJUGATE_GRADIENT_STEPS",
         "PRIOR_SCALE",
         "SMOOTHNESS_FLOOR",

@@ -23,6 +23,8 @@ from ssa_nerfstudio.overlay.resampling import smallest_matte
 ROUNDS = 8
 """Alternations between layers and colors of points; the last half under the sparse prior."""
 CONJUGATE_GRADIENT_STEPS = 80
+COLOR_ROUNDS = 3
+"""Alternations between the points' first colors and the pixels that hide them."""
 PRIOR_SCALE = 0.05
 """Difference of T or B up to which the sparse prior takes a pixel for as expected."""
 SMOOTHNESS_FLOOR = 0.01
@@ -39,6 +41,9 @@ CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
 clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges."""
+
+_LEAST_WEIGHT = 1e-3
+"""Of a sample: a point that has no better ones still has their median."""
 
 
 @dataclass(frozen=True)
@@ -99,12 +104,10 @@ def estimate_layers(
     """
     height, width = samples.size
     observed, point, pixel = samples.color, samples.point, samples.pixel
-    colors = _initial_colors(samples, deviation)
+    colors, residual = _start(samples, mean, deviation)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
-    clear, constant = observed - colors[point], observed - mean.reshape(-1, 3)[pixel]
     layers = expected = expected_layers(samples, colors[point], mean, deviation, hidden, static)
     prior = torch.ones_like(layers[..., :1])
-    residual = _initial_residual(samples, clear, constant)
     seen_by = torch.bincount(point, minlength=samples.points)[point]
     uncertainty = 1 / (seen_by[:, None] - 1.0).clamp_min(1e-6)
     for round_ in range(ROUNDS):
@@ -151,26 +154,41 @@ def robust_deviation(residuals: Tensor) -> Tensor:
     return 1.48 * residuals.abs().median() + GRAY_LEVEL
 
 
-def _initial_residual(samples: PointSamples, clear: Tensor, constant: Tensor) -> Tensor:
-    """Differences [S, 3] from the points' colors, `clear`, and where all of those disagree from the mean, `constant`.
+def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+    """First colors of the points [N, 3], and the residuals of their samples [S, 3].
+
+    A color is the median of the point's samples, each weighed by how much the photos vary at its pixel: what is in
+    front varies little. But a thumb in changing light may vary more than a plain floor. So colors and the pixels that
+    hide them are found by turns, and the samples of these leave the median to the others.
 
     Behind what is opaque every sample is an outlier to a clear pixel. Robust weights would then silence all of them,
-    and the prior would take the pixel for clear. So a pixel starts as either, by the sum of the absolute differences
-    around it.
+    and the prior would take the pixel for clear. So the residuals of a pixel that hides are those of an opaque one.
+    """
+    variance = deviation.flatten().square()
+    weight = (variance / variance.median().clamp_min(1e-12)).clamp_max(1.0)[samples.pixel].double() + _LEAST_WEIGHT
+    constant = samples.color - mean.reshape(-1, 3)[samples.pixel]
+    colors = _medians(samples, weight)
+    for _ in range(COLOR_ROUNDS):
+        hiding = _hiding(samples, samples.color - colors[samples.point], constant)
+        colors = _medians(samples, torch.where(hiding, _LEAST_WEIGHT * weight, weight))
+    clear = samples.color - colors[samples.point]
+    return colors, torch.where(_hiding(samples, clear, constant)[:, None], constant, clear)
+
+
+def _hiding(samples: PointSamples, clear: Tensor, constant: Tensor) -> Tensor:
+    """Whether more than half of the scene is hidden where a sample is, bool [S].
+
+    There the photos are nearer to their mean (differences `constant` [S, 3]) than to the points (`clear`), by the sum
+    of absolute differences around the pixel.
     """
     height, width = samples.size
     excess = (constant.abs() - clear.abs()).sum(dim=-1, keepdim=True)
     around = local_mean(summed(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
-    return torch.where(around.reshape(-1, 1)[samples.pixel] < 0, constant, clear)
+    return around.flatten()[samples.pixel] < 0
 
 
-def _initial_colors(samples: PointSamples, deviation: Tensor) -> Tensor:
-    """The points' median colors [N, 3], each sample weighed by how much the photos vary at its pixel.
-
-    What is in front of the scene varies little.
-    """
-    variance = deviation.flatten().square()
-    weight = (variance / variance.median().clamp_min(1e-12)).clamp_max(1.0)[samples.pixel].double() + 1e-3
+def _medians(samples: PointSamples, weight: Tensor) -> Tensor:
+    """Weighted median colors [N, 3] of the points, given the samples' weights [S]."""
     sums = nn.functional.pad(weight.cumsum(0), (1, 0))
     points = torch.arange(samples.points, device=weight.device)
     first = torch.searchsorted(samples.point, points)

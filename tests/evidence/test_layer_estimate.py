@@ -131,6 +131,35 @@ def test_a_calm_area_that_hides_the_scene_wherever_points_tell_hides_it_everywhe
     assert found.transmittance[core].mean() < 0.05
 
 
+def test_a_thumb_in_changing_light_leaves_a_plain_floor_beside_it_clear() -> None:
+    """The thumb varies more than the floor: by the photos' variance alone the floor's points would have its color."""
+    generator = torch.Generator().manual_seed(0)
+    views, walls, floors = 60, 500, 100
+    colors = torch.cat([BRIGHTEST * torch.rand(walls, 3, generator=generator), torch.full((floors, 3), 0.2)])
+    colors[walls:] += 0.15 * torch.rand(floors, 3, generator=generator)
+    thumb, floor = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    thumb[12:, 32:], floor[24:, 16:32] = True, True
+    behind, beside, elsewhere = (each.flatten().nonzero()[:, 0] for each in (thumb, floor, ~floor))
+    point, view = torch.arange(walls + floors).repeat(views), torch.arange(views).repeat_interleave(walls + floors)
+    hidden = torch.rand(len(point), generator=generator) < 0.2
+    places = [
+        each[torch.randint(len(each), (len(point),), generator=generator)] for each in (behind, beside, elsewhere)
+    ]
+    pixel = torch.where(point < walls, places[2], torch.where(hidden, places[0], places[1]))
+    light = 1 + 0.3 * torch.randn(views, 1, generator=generator)
+    shown = torch.where(thumb.flatten()[pixel][:, None], torch.tensor([0.6, 0.4, 0.3]) * light[view], colors[point])
+    shown = (shown + 0.01 * torch.randn(shown.shape, generator=generator)).clamp(0, 1)
+    order = np.lexsort((shown.sum(dim=-1).numpy(), point.numpy()))
+    samples = PointSamples(point[order], pixel[order], shown[order], walls + floors, (HEIGHT, WIDTH), view[order])
+    mean = torch.full((HEIGHT, WIDTH, 3), BRIGHTEST / 2)
+    mean[thumb], mean[floor] = torch.tensor([0.6, 0.4, 0.3]), 0.275
+    deviation = torch.full((HEIGHT, WIDTH, 1), 0.17)
+    deviation[thumb], deviation[floor] = 0.18, 0.045
+    found = estimate_layers(samples, mean, deviation, NOWHERE, NOWHERE)
+    assert found.transmittance[thumb].mean() < 0.1
+    assert found.transmittance[floor].mean() > 0.9
+
+
 def test_a_film_over_a_plain_part_of_the_scene_is_not_taken_for_opaque() -> None:
     """A path that stays in the middle of the frame, all of one color: photos hardly vary there, yet it is seen."""
     plain, color, through = disc(0.02)[..., 0] > 0.5, torch.tensor([0.4, 0.35, 0.3]), 0.8
