@@ -34,7 +34,7 @@ def gradients_of(
     n = len(means)
     _differentiate[(triton.cdiv(n, _BLOCK),)](
         means, center, rest, radii, colors, slopes, of_means, of_constant, of_rest, n, 3 * rest.shape[1],
-        rest.shape[1], degree, _BLOCK,
+        triton.next_power_of_2(3 * rest.shape[1]), degree, _BLOCK,
     )  # fmt: skip
     return of_means, of_constant, of_rest
 
@@ -131,9 +131,13 @@ def _evaluate(
 @triton.jit(do_not_specialize=["n"])
 def _differentiate(
     means, center, rest, radii, colors, slopes, of_means, of_constant, of_rest, n, STRIDE: tl.constexpr,
-    COUNT: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
+    COLUMNS: tl.constexpr, DEGREE: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
-    """Of a basis function b, d/d mean is (I - u u^T) grad b / |mean - center| with the unit direction u."""
+    """Of a basis function b, d/d mean is (I - u u^T) grad b / |mean - center| with the unit direction u.
+
+    A Gaussian's coefficients lie side by side, so their gradients are stored at once: one by one, each would be a write
+    of its own to a sector of memory.
+    """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     inside = i < n
     drawn = inside & (tl.load(radii + i, mask=inside, other=0) > 0)
@@ -144,25 +148,26 @@ def _differentiate(
     tl.store(of_constant + 3 * i, 0.28209479177387814 * red, mask=inside)
     tl.store(of_constant + 3 * i + 1, 0.28209479177387814 * green, mask=inside)
     tl.store(of_constant + 3 * i + 2, 0.28209479177387814 * blue, mask=inside)
-    nothing = tl.zeros_like(x)
-    along_x, along_y, along_z = nothing, nothing, nothing
-    for k in tl.static_range(1, COUNT + 1):
+    along_x, along_y, along_z = tl.zeros_like(x), tl.zeros_like(x), tl.zeros_like(x)
+    column = tl.arange(0, COLUMNS)
+    values = tl.zeros([BLOCK, COLUMNS], dtype=tl.float32)
+    for k in tl.static_range(1, (DEGREE + 1) * (DEGREE + 1)):
         at = STRIDE * i + 3 * (k - 1)
-        if k < (DEGREE + 1) * (DEGREE + 1):
-            value, by_x, by_y, by_z = _basis(k, x, y, z)
-            slope = red * tl.load(rest + at, mask=drawn, other=0.0)
-            slope += green * tl.load(rest + at + 1, mask=drawn, other=0.0)
-            slope += blue * tl.load(rest + at + 2, mask=drawn, other=0.0)
-            along_x += slope * by_x
-            along_y += slope * by_y
-            along_z += slope * by_z
-            tl.store(of_rest + at, value * red, mask=inside)
-            tl.store(of_rest + at + 1, value * green, mask=inside)
-            tl.store(of_rest + at + 2, value * blue, mask=inside)
-        else:
-            tl.store(of_rest + at, nothing, mask=inside)
-            tl.store(of_rest + at + 1, nothing, mask=inside)
-            tl.store(of_rest + at + 2, nothing, mask=inside)
+        value, by_x, by_y, by_z = _basis(k, x, y, z)
+        slope = red * tl.load(rest + at, mask=drawn, other=0.0)
+        slope += green * tl.load(rest + at + 1, mask=drawn, other=0.0)
+        slope += blue * tl.load(rest + at + 2, mask=drawn, other=0.0)
+        along_x += slope * by_x
+        along_y += slope * by_y
+        along_z += slope * by_z
+        values = tl.where((column // 3 == k - 1)[None, :], value[:, None], values)
+    channel = (column % 3)[None, :]
+    values *= tl.where(channel == 0, red[:, None], tl.where(channel == 1, green[:, None], blue[:, None]))
+    counts = (column < 3 * ((DEGREE + 1) * (DEGREE + 1) - 1))[None, :]
+    tl.store(
+        of_rest + STRIDE * i[:, None] + column[None, :], tl.where(counts, values, 0.0),
+        mask=inside[:, None] & (column < STRIDE)[None, :],
+    )  # fmt: skip
     radial = along_x * x + along_y * y + along_z * z
     tl.store(of_means + 3 * i, inverse * (along_x - radial * x), mask=inside)
     tl.store(of_means + 3 * i + 1, inverse * (along_y - radial * y), mask=inside)

@@ -6,22 +6,16 @@ view matrix with `torch.inverse`, which waits for the device at every frame. A r
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
-from gsplat import (
-    fully_fused_projection,
-    isect_offset_encode,
-    isect_tiles,
-    rasterize_to_pixels,
-    spherical_harmonics,
-)
+from gsplat import fully_fused_projection, rasterize_to_pixels, spherical_harmonics
 from gsplat.cuda._wrapper import _RasterizeToPixels
 from torch import Tensor
 
 from ssa_nerfstudio.rasterization.constants import TILE
 from ssa_nerfstudio.rasterization.interface import Cameras, Gaussians, RenderOptions, make_rasterization
+from ssa_nerfstudio.rasterization.tile_lists import tile_lists
 
 
 class Projected(NamedTuple):
@@ -107,12 +101,8 @@ def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: Ren
 
 
 def _tile_lists(projected: Projected, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Where each tile's Gaussians begin [C, rows, columns], and all of them, nearest first [M]."""
-    n_cameras, tiles = len(projected.means2d), (math.ceil(width / TILE), math.ceil(height / TILE))
-    _, isect_ids, flatten_ids = isect_tiles(
-        projected.means2d, projected.radii, projected.depths, TILE, *tiles, packed=False, n_cameras=n_cameras
-    )
-    return isect_offset_encode(isect_ids, n_cameras, *tiles), flatten_ids
+    means2d, conics, alphas, depths, radii = (each.detach() for each in projected)
+    return tile_lists(means2d, conics, alphas, depths, radii, width, height)
 
 
 class Blending:

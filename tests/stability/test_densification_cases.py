@@ -9,14 +9,14 @@ import pytest
 import torch
 from hard_cases import Case, Family
 
-from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import repair_mcmc
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo
 
 DENSIFICATION = Family("Densification")
 Params = torch.nn.ParameterDict
 Optimizers = dict[str, torch.optim.Optimizer]
 
-enable_mcmc_on_cpu()
+repair_mcmc()
 
 
 def gaussians(n: int) -> tuple[Params, Optimizers]:

@@ -8,21 +8,26 @@ from functools import cache
 import gsplat.strategy.ops
 import torch
 from gsplat.cuda._torch_impl import _quat_scale_to_covar_preci
+from gsplat.cuda._wrapper import _make_lazy_cuda_func
 from torch import Tensor
 
 
 @cache
-def enable_mcmc_on_cpu() -> None:
-    """Give gsplat's MCMC strategy torch implementations of its two CUDA kernels, chosen by the tensors' device.
+def repair_mcmc() -> None:
+    """Give gsplat's MCMC strategy torch implementations of its two CUDA kernels, chosen by the tensors' device, and on
+    CUDA the relocation's kernel alone.
+
+    gsplat's wrapper of that kernel also fills a table of binomials that nothing reads, in 1326 writes to the device: 17
+    ms, twice a refinement (gsplat/relocation.py:40).
 
     Called when an MCMC strategy is made, not at import. May go when gsplat ships CPU bodies
-    (https://github.com/nerfstudio-project/gsplat/issues/635).
+    (https://github.com/nerfstudio-project/gsplat/issues/635) and drops the table.
     """
     ops = gsplat.strategy.ops
-    cuda_relocation, cuda_covariance = ops.compute_relocation, ops.quat_scale_to_covar_preci
+    cuda_covariance = ops.quat_scale_to_covar_preci
 
     def compute_relocation(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor):
-        body = cuda_relocation if opacities.is_cuda else relocated
+        body = _relocated_on_cuda if opacities.is_cuda else relocated
         return body(opacities, scales, ratios, binoms)
 
     def quat_scale_to_covar_preci(quats: Tensor, scales: Tensor, *args, **kwargs):
@@ -31,6 +36,13 @@ def enable_mcmc_on_cpu() -> None:
 
     ops.compute_relocation = compute_relocation
     ops.quat_scale_to_covar_preci = quat_scale_to_covar_preci
+
+
+def _relocated_on_cuda(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:
+    """`relocated` by gsplat's kernel."""
+    kernel = _make_lazy_cuda_func("compute_relocation")
+    counts = ratios.clamp(1, len(binoms)).int()
+    return kernel(opacities.contiguous(), scales.contiguous(), counts.contiguous(), binoms, len(binoms))
 
 
 def relocated(opacities: Tensor, scales: Tensor, ratios: Tensor, binoms: Tensor) -> tuple[Tensor, Tensor]:

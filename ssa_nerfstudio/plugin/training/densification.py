@@ -15,7 +15,7 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from torch import Tensor
 from torch.nn import ParameterDict
 
-from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import repair_mcmc
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training.gradient_statistics import GradientStatistics
 from ssa_nerfstudio.plugin.training.langevin_noise import perturb
@@ -130,7 +130,7 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     """Relocate Gaussians that are not finite, and revive a scene in which all are dead."""
 
     def __post_init__(self) -> None:
-        enable_mcmc_on_cpu()  # also where there is CUDA: the training may run on the CPU
+        repair_mcmc()  # also where there is CUDA: the training may run on the CPU
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of the strategy; the scene's scale plays no part in it."""

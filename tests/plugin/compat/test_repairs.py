@@ -111,14 +111,14 @@ def test_gsplats_relocation_needs_cuda_and_runs_on_a_cpu_when_repaired():
     arguments = torch.rand(4), torch.rand(4, 3), torch.full((4,), 2), torch.ones(5, 5)
     with pytest.raises(Exception):  # noqa: B017, PT011 - whatever a missing backend raises
         _wrapper._make_lazy_cuda_func("compute_relocation")(*arguments, 5)
-    gsplat_repairs.enable_mcmc_on_cpu()
+    gsplat_repairs.repair_mcmc()
     opacities, scales = gsplat.strategy.ops.compute_relocation(*arguments)
     assert torch.isfinite(opacities).all()
     assert scales.shape == (4, 3)
 
 
 def test_gsplats_covariances_are_those_of_scaled_and_turned_axes_when_repaired():
-    gsplat_repairs.enable_mcmc_on_cpu()
+    gsplat_repairs.repair_mcmc()
     quarter_turn = torch.tensor([[1.0, 0.0, 0.0, 1.0]])  # about z, not normalized
     covariances, _ = gsplat.strategy.ops.quat_scale_to_covar_preci(
         quarter_turn, torch.tensor([[1.0, 2.0, 3.0]]), compute_preci=False, triu=False

@@ -14,7 +14,7 @@ from gsplat.strategy import DefaultStrategy, MCMCStrategy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu, relocated
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import relocated, repair_mcmc
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.gradient_statistics import GradientStatistics
@@ -25,7 +25,7 @@ WIDTH, HEIGHT = 40, 30
 
 @pytest.fixture(autouse=True, scope="module")
 def mcmc_on_cpu() -> None:
-    enable_mcmc_on_cpu()
+    repair_mcmc()
 
 
 def gaussians(n: int, seed: int = 0) -> tuple[torch.nn.ParameterDict, dict[str, torch.optim.Optimizer]]:
@@ -175,6 +175,20 @@ def test_relocation_is_equation_nine(o, s, n):
     np.testing.assert_allclose(new_scale.numpy(), expected_scale, rtol=1e-6)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_relocation_on_a_gpu_is_that_of_a_cpu_and_writes_no_table():
+    binoms = MarkovChainMonteCarlo().initialize_state()["binoms"].cuda()
+    opacities, scales = torch.rand(500).clamp(0.01, 0.99).cuda(), torch.rand(500, 3).cuda()
+    counts = torch.randint(1, 60, (500,)).cuda()
+    with torch.profiler.profile() as profiler:
+        found = ops.compute_relocation(opacities, scales, counts, binoms)
+    expected = relocated(opacities.cpu(), scales.cpu(), counts.cpu(), binoms.cpu())
+    torch.testing.assert_close(found[0].cpu(), expected[0], rtol=1e-4, atol=1e-6)
+    few = counts.cpu() <= 8  # of more, the sum's alternating terms cancel in the kernel's float32
+    torch.testing.assert_close(found[1].cpu()[few], expected[1][few], rtol=1e-2, atol=1e-5)
+    assert sum(each.count for each in profiler.key_averages() if each.key.startswith("aten::")) < 30
+
+
 @pytest.mark.parametrize("n", [1, 2, 51, 400])
 def test_relocation_keeps_the_opacity_of_the_whole_and_shrinks(n):
     binoms = MarkovChainMonteCarlo().initialize_state()["binoms"]
@@ -237,8 +251,8 @@ def test_mcmc_relocates_adds_and_perturbs_as_gsplats_does():
 
 INTERPRETED = """
 import torch
-from ssa_nerfstudio.plugin.compat.gsplat_repairs import enable_mcmc_on_cpu
-enable_mcmc_on_cpu()
+from ssa_nerfstudio.plugin.compat.gsplat_repairs import repair_mcmc
+repair_mcmc()
 from gsplat.strategy.ops import inject_noise_to_position
 from ssa_nerfstudio.plugin.training._langevin_noise_triton import perturb_means
 
