@@ -55,6 +55,7 @@ ESTIMATE = {
     "layer_estimate": (
         "ROUNDS",
         "COLOR_ROUNDS",
+        "MOST_SHOWN",
         "CONJUGATE_GRADIENT_STEPS",
         "PRIOR_SCALE",
         "SMOOTHNESS_FLOOR",

@@ -25,6 +25,8 @@ ROUNDS = 8
 CONJUGATE_GRADIENT_STEPS = 80
 COLOR_ROUNDS = 3
 """Alternations between the points' first colors and the pixels that hide them."""
+MOST_SHOWN = 1 / 3
+"""Share of the scene up to which a pixel counts as hiding it in these."""
 PRIOR_SCALE = 0.05
 """Difference of T or B up to which the sparse prior takes a pixel for as expected."""
 SMOOTHNESS_FLOOR = 0.01
@@ -159,7 +161,8 @@ def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tens
 
     A color is the median of the point's samples, each weighed by how much the photos vary at its pixel: what is in
     front varies little. But a thumb in changing light may vary more than a plain floor. So colors and the pixels that
-    hide them are found by turns, and the samples of these leave the median to the others.
+    hide them are found by turns, and the samples of these leave the median to the others. That takes more than it
+    takes to start as opaque: a third of the scene, because the colors, too, are uncertain where all photos agree.
 
     Behind what is opaque every sample is an outlier to a clear pixel. Robust weights would then silence all of them,
     and the prior would take the pixel for clear. So the residuals of a pixel that hides are those of an opaque one.
@@ -169,20 +172,20 @@ def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tens
     constant = samples.color - mean.reshape(-1, 3)[samples.pixel]
     colors = _medians(samples, weight)
     for _ in range(COLOR_ROUNDS):
-        hiding = _hiding(samples, samples.color - colors[samples.point], constant)
+        hiding = _hiding(samples, samples.color - colors[samples.point], constant, MOST_SHOWN)
         colors = _medians(samples, torch.where(hiding, _LEAST_WEIGHT * weight, weight))
     clear = samples.color - colors[samples.point]
-    return colors, torch.where(_hiding(samples, clear, constant)[:, None], constant, clear)
+    return colors, torch.where(_hiding(samples, clear, constant, 0.5)[:, None], constant, clear)
 
 
-def _hiding(samples: PointSamples, clear: Tensor, constant: Tensor) -> Tensor:
-    """Whether more than half of the scene is hidden where a sample is, bool [S].
+def _hiding(samples: PointSamples, clear: Tensor, constant: Tensor, shown: float) -> Tensor:
+    """Whether at most the share `shown` of the scene comes through where a sample is, bool [S].
 
-    There the photos are nearer to their mean (differences `constant` [S, 3]) than to the points (`clear`), by the sum
-    of absolute differences around the pixel.
+    What comes through of a scene varies by T |C - mean C|, so differences from the photos' mean, `constant` [S, 3], are
+    T / (1 - T) times those from the points, `clear`, summed over their absolute values around the pixel.
     """
     height, width = samples.size
-    excess = (constant.abs() - clear.abs()).sum(dim=-1, keepdim=True)
+    excess = (constant.abs() - shown / (1 - shown) * clear.abs()).sum(dim=-1, keepdim=True)
     around = local_mean(summed(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
     return around.flatten()[samples.pixel] < 0
 
