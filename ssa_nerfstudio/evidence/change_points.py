@@ -26,7 +26,7 @@ from ssa_nerfstudio.evidence.edge_evidence import (
     block_images,
     gradient_moments,
 )
-from ssa_nerfstudio.evidence.null_distribution import MAX_SHIFT
+from ssa_nerfstudio.evidence.null_distribution import MAX_SHIFT, VALUES_AT_ONCE
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 MIN_CHANGED_SHARE = 2 * MIN_EDGE_SHARES[0]
@@ -208,22 +208,30 @@ def _changed_shares(moments: Tensor, intervals: list[tuple[int, int]]) -> np.nda
         moments: of blocks [K, 3, h, w].
         intervals: first block, and that after the last.
     """
-    sums = torch.cat([torch.zeros_like(moments[:1]), moments.cumsum(dim=0)])
+    sums = torch.cat([torch.zeros_like(moments[:1]), moments.cumsum(dim=0)]).transpose(0, 1)
+    at_once = max(1, VALUES_AT_ONCE // sums[:, 0].numel())
     shares = []
-    for start, end in intervals:
-        inside = sums[end] - sums[start]
-        parts = (inside, end - start), (sums[-1] - inside, len(moments) - (end - start))
-        shares.append(max(float(_only_in(*a, *b).float().mean()) for a, b in (parts, parts[::-1])))
-    return np.array(shares)
+    for first in range(0, len(intervals), at_once):
+        starts, ends = torch.tensor(intervals[first : first + at_once], device=sums.device).unbind(dim=1)
+        inside, count = sums[:, ends] - sums[:, starts], (ends - starts)[:, None, None]
+        parts = (inside, count), (sums[:, -1:] - inside, len(moments) - count)
+        alone = [_only_in(*a, *b).float().mean(dim=(1, 2)) for a, b in (parts, parts[::-1])]
+        shares.append(torch.maximum(*alone).cpu().numpy())
+    return np.concatenate(shares).astype(np.float64)
 
 
-def _summed(moments: Tensor) -> tuple[Tensor, int]:
+def _summed(moments: Tensor) -> tuple[Tensor, Tensor]:
     """Sum of the moments of blocks, and their number."""
-    return moments.sum(dim=0), len(moments)
+    return moments.sum(dim=0), torch.tensor(len(moments))
 
 
-def _only_in(sums: Tensor, count: int, other: Tensor, other_count: int) -> Tensor:
-    """Pixels [h, w] with a static edge that the other blocks lack, or have at most half of, given sums of moments."""
+def _only_in(sums: Tensor, count: Tensor, other: Tensor, other_count: Tensor) -> Tensor:
+    """Pixels [..., h, w] with a static edge that the other blocks lack, or have at most half of.
+
+    Args:
+        sums, other: of moments, [3, ..., h, w].
+        count, other_count: of blocks, [..., 1, 1] or [].
+    """
     mean, length, error = _mean_gradient(sums, count)
     missing, other_length, other_error = _mean_gradient(other, other_count)
     along = (mean * missing).sum(dim=0)
@@ -232,7 +240,7 @@ def _only_in(sums: Tensor, count: int, other: Tensor, other_count: int) -> Tenso
     return (length >= least * error) & (along <= 0.5 * length) & different
 
 
-def _mostly_missing(sums: Tensor, count: int, other: Tensor, other_count: int) -> Tensor:
+def _mostly_missing(sums: Tensor, count: Tensor, other: Tensor, other_count: Tensor) -> Tensor:
     """Pixels [h, w] around which the other blocks lack at least half of the static edges, as in `_only_in`."""
     mean, length, error = _mean_gradient(sums, count)
     along = (mean * _mean_gradient(other, other_count)[0]).sum(dim=0)
@@ -242,8 +250,8 @@ def _mostly_missing(sums: Tensor, count: int, other: Tensor, other_count: int) -
     return kept <= 0.5 * there
 
 
-def _mean_gradient(sums: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean gradient [2, h, w], its squared length and its squared standard error with detection's floor, [h, w]."""
+def _mean_gradient(sums: Tensor, count: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean gradient [2, ...], its squared length and its squared standard error with detection's floor, [...]."""
     mean = sums / count
     length = mean[:2].square().sum(dim=0)
-    return mean[:2], length, (mean[2] - length).clamp_min(0) / max(1, count - 1) + _ERROR_FLOOR
+    return mean[:2], length, (mean[2] - length).clamp_min(0) / (count - 1).clamp_min(1) + _ERROR_FLOOR

@@ -40,11 +40,15 @@ def displaced_share(images: Tensor, gradient: Tensor, window: int) -> Tensor:
     ridge = 0.01 * (xx + yy).clamp_min(torch.finfo(images.dtype).eps)
     xx, yy = xx + ridge, yy + ridge
     determinant = (xx * yy - xy.square()).clamp_min(ridge.square())
+    deviations = images - basis[0]
+    level = window_mean(deviations, window)
+    products = window_mean((basis[:, None] * deviations).flatten(0, 1), window).unflatten(0, (3, len(images)))
+    with_mean, *with_gradient = products - levels[:, None] * level
+    x, y = torch.stack(with_gradient) - gain[:, None] * with_mean
+    fits = (yy * x.square() - 2 * xy * x * y + xx * y.square()) / determinant
+    variances = window_mean(deviations.square(), window) - level.square()
     explained, total = torch.zeros_like(images[0]), torch.zeros_like(images[0])
-    for deviation in (images - basis[0])[:, None]:
-        level = window_mean(deviation, window)
-        with_mean, *with_gradient = window_mean(basis * deviation, window) - levels * level
-        x, y = torch.stack(with_gradient) - gain * with_mean
-        explained += (yy * x.square() - 2 * xy * x * y + xx * y.square()) / determinant
-        total += (window_mean(deviation.square(), window) - level.square())[0]
+    for fit, variance in zip(fits, variances, strict=True):  # one after the other: the same sum on any device
+        explained += fit
+        total += variance
     return (explained / total.clamp_min(len(images) * _LEAST_VARIANCE)).clamp(0, 1)

@@ -52,7 +52,7 @@ class EdgeEvidence:
     @property
     def shares(self) -> tuple[float, float]:
         """`edge_shares` of the fields."""
-        return edge_shares(self.fields, self.still)
+        return edge_shares([field[None] for field in self.fields], self.still)[0]
 
     @cached_property
     def mask(self) -> np.ndarray:
@@ -115,11 +115,11 @@ def evidence_field(sums: Tensor, count: int) -> Tensor:
     The error has a floor that keeps a gradient below MIN_GRADIENT below the fine scale's threshold.
 
     Args:
-        sums: of moments over `count` blocks, [3, h, w].
+        sums: of moments over `count` blocks, [3, ..., h, w].
         count: of blocks.
 
     Returns:
-        [h, w], not negative.
+        [..., h, w], not negative.
     """
     mean = sums / count
     length = mean[:2].square().sum(dim=0)
@@ -127,17 +127,21 @@ def evidence_field(sums: Tensor, count: int) -> Tensor:
     return (length / error.add_((MIN_GRADIENT / EVIDENCE_THRESHOLDS[0]) ** 2)).sqrt_()
 
 
-def edge_shares(fields: list[Tensor], still: list[Tensor]) -> tuple[float, float]:
+def edge_shares(fields: list[Tensor], still: list[Tensor]) -> list[tuple[float, float]]:
     """Shares of the frame, at the fine and the coarse scale, that are static edges which do not move.
 
     Args:
-        fields, still: as in `EdgeEvidence`.
+        fields: of n captures, at each scale [n, h, w].
+        still: as in `EdgeEvidence`.
+
+    Returns:
+        A pair for each capture.
     """
     fine, coarse = (
-        float(((field >= threshold) & unmoved).float().mean())
+        ((field >= threshold) & unmoved).float().mean(dim=(1, 2)).tolist()
         for field, unmoved, threshold in zip(fields, still, EVIDENCE_THRESHOLDS, strict=True)
     )
-    return fine, coarse
+    return [*zip(fine, coarse, strict=True)]
 
 
 def gradient_moments(images: Tensor, hidden: Tensor) -> Tensor:

@@ -17,6 +17,8 @@ from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence, e
 
 MAX_SHIFT = 16
 """Blocks are shifted by up to this many working pixels in each direction, in steps of COARSE_FACTOR."""
+VALUES_AT_ONCE = 2**22
+"""Of sums of moments, in memory: a GPU waits for its host, which does so much at once."""
 
 
 def null_shares(evidence: EdgeEvidence, draws: int, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
@@ -37,16 +39,20 @@ def null_shares(evidence: EdgeEvidence, draws: int, rng: np.random.Generator) ->
     reach = MAX_SHIFT // COARSE_FACTOR
     steps = COARSE_FACTOR, 1
     padded_moments = [_wrap_pad(at_scale, reach * step) for at_scale, step in zip(moments, steps, strict=True)]
-    for _ in range(draws):
-        shifts = rng.integers(0, 2 * reach + 1, (len(moments[0]), 2)).tolist()
+    at_once = max(1, VALUES_AT_ONCE // moments[0][0].numel())
+    for first in range(0, draws, at_once):
+        count = min(at_once, draws - first)
+        shifts = rng.integers(0, 2 * reach + 1, (count, len(moments[0]), 2)).tolist()
         fields = []
         for at_scale, padded, step in zip(moments, padded_moments, steps, strict=True):
             h, w = at_scale.shape[2:]
-            sums = torch.zeros_like(at_scale[0])
-            for block, (y, x) in zip(padded, shifts, strict=True):
-                sums += block[:, y * step : y * step + h, x * step : x * step + w]
+            sums = at_scale.new_zeros(3, count, h, w)
+            for draw, of_blocks in enumerate(shifts):
+                own = sums[:, draw]
+                for block, (y, x) in zip(padded, of_blocks, strict=True):
+                    own += block[:, y * step : y * step + h, x * step : x * step + w]
             fields.append(evidence_field(sums, len(at_scale)))
-        yield edge_shares(fields, evidence.still)
+        yield from edge_shares(fields, evidence.still)
 
 
 def clopper_pearson(successes: int, trials: int) -> tuple[float, float]:

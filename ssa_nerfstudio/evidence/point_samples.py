@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import accumulate
 
 import torch
 from torch import Tensor, nn
@@ -21,6 +22,8 @@ MAX_PROJECTIONS = 5_000_000
 """Points times views; of more points a regular subset is projected, whose samples are dense enough."""
 VIEWS_AT_ONCE = 64
 """Views whose points are compared by depth together; a larger number only costs memory."""
+VALUES_AT_ONCE = 2**24
+"""Color values of photos that are read together on a GPU, which waits for its host. A CPU's cache is for one photo."""
 MIN_DEPTH = 1e-6
 """World units; points nearer to a camera's plane are behind it."""
 
@@ -129,28 +132,35 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     farthest = seen.depth.new_zeros(len(points)).scatter_reduce(0, seen.point, seen.depth, "amax")
     footprint = (2 * OCCLUSION_RADIUS + 1) * farthest[seen.point] / seen.depth
     counts = torch.bincount(seen.view, minlength=len(views)).tolist()
-    by_view = (each.split(counts) for each in (seen.pixel, seen.position, footprint))
-    colors, patches, kept = [], [], []
-    for view, pixel, position, side in zip(views, *by_view, strict=True):
-        image, unmasked, inside = view.image[..., :3].to(points.device), None, torch.ones_like(pixel, dtype=torch.bool)
-        if view.mask is not None:
-            mask = view.mask.reshape(height, width, 1).to(points.device) != 0
-            image, unmasked = torch.where(mask, image, 0), _boxes(mask, reduction)
-            inside = unmasked[::reduction, ::reduction].flatten()[pixel] == 1
-            inside &= _read(unmasked, position, reduction)[:, 0] > 1 - GRAY_LEVEL
+    colors, patches, kept, at_once = [], [], [], _photos_at_once(points.device, 3 * height * width)
+    ends = [0, *accumulate(counts)]
+    for first in range(0, len(views), at_once):
+        some = views[first : first + at_once]
+        own = slice(ends[first], ends[first + len(some)])
+        view, pixel, position, side = seen.view[own] - first, seen.pixel[own], seen.position[own], footprint[own]
+        images = torch.stack([each.image[..., :3].to(points.device).float() for each in some])
+        unmasked = None
+        inside = torch.ones_like(pixel, dtype=torch.bool)
+        if any(each.mask is not None for each in some):
+            everywhere = torch.ones(height, width)
+            masks = [everywhere if each.mask is None else each.mask.reshape(height, width) != 0 for each in some]
+            shown = torch.stack([mask.to(points.device, torch.bool) for mask in masks])[..., None]
+            images, unmasked = torch.where(shown, images, 0), _boxes(shown, reduction)
+            inside = unmasked[:, ::reduction, ::reduction].reshape(len(some), -1)[view, pixel] == 1
+            inside &= _read(unmasked, view, position, reduction)[:, 0] > 1 - GRAY_LEVEL
         kept.append(inside)
-        boxes = _boxes(image, reduction)
-        colors.append(_read(boxes, position, reduction))
+        boxes = _boxes(images, reduction)
+        colors.append(_read(boxes, view, position, reduction))
         if guide is not None:
             boxes = boxes if unmasked is None else torch.cat([boxes, unmasked], dim=-1)
-            patch = _patch_means(boxes[::reduction, ::reduction], pixel, side)
+            patch = _patch_means(boxes[:, ::reduction, ::reduction], view, pixel, side)
             patches.append(patch if unmasked is None else patch[:, :3] / patch[:, 3:])
     same = torch.ones(3, device=points.device)
     gains = torch.stack([same if view.gain is None else view.gain.to(same) for view in views])
     white = gains * gains.new_tensor([[FULL_SCALE.get(view.image.dtype, 1.0)] for view in views])
     color, patch = torch.cat(colors) / white[seen.view], None
     if guide is not None:
-        here, there = of_pixels[seen.pixel], _read(guide, seen.position, reduction)
+        here, there = of_pixels[seen.pixel], _read(guide[None], torch.zeros_like(seen.view), seen.position, reduction)
         color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
         color = color.clamp_min(0).minimum(1 / gains[seen.view])
         patch = torch.cat(patches) / white[seen.view]
@@ -160,6 +170,11 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     focal_lengths = torch.stack([view.intrinsics.diagonal()[:2] for view in views]).mean(dim=0)
     ratio = float(focal_lengths[0] / focal_lengths[1])
     return PointSamples(point, pixel, color, len(points), size, shown_by, patch, ratio).ordered()
+
+
+def _photos_at_once(device: torch.device, values: int) -> int:
+    """Number of photos, each of so many color values, that are read together."""
+    return max(1, VALUES_AT_ONCE // values) if device.type == "cuda" else 1
 
 
 def regular_subset(points: Tensor, views: int) -> Tensor:
@@ -204,10 +219,11 @@ def _matched(color: Tensor, here: Tensor, there: Tensor) -> Tensor:
     return here[:, :3] + (color - there[:, :3]) * ratio
 
 
-def _boxes(image: Tensor, side: int) -> Tensor:
-    """Means [H - side + 1, W - side + 1, C] of an image [H, W, C] over all squares of this side, in its own units."""
-    means = image.float()
-    for dim in (0, 1):
+def _boxes(images: Tensor, side: int) -> Tensor:
+    """Means [..., H - side + 1, W - side + 1, C] of images [..., H, W, C] over all squares of this side, in their own
+    units."""
+    means = images.float()
+    for dim in (-3, -2):
         length = means.shape[dim] - side + 1
         rows = means.narrow(dim, 0, length).clone()
         for shift in range(1, side):
@@ -216,32 +232,34 @@ def _boxes(image: Tensor, side: int) -> Tensor:
     return means
 
 
-def _read(boxes: Tensor, position: Tensor, side: int) -> Tensor:
+def _read(boxes: Tensor, view: Tensor, position: Tensor, side: int) -> Tensor:
     """Means [M, C] over the boxes around x, y [M, 2], moved into the frame; between pixels by bilinear interpolation.
 
     Args:
-        boxes: see `_boxes`.
+        boxes: of V views, see `_boxes`.
+        view: [M], whose.
         position: in the photo, pixels.
         side: of the boxes.
     """
-    last = position.new_tensor([boxes.shape[1] - 1, boxes.shape[0] - 1])
-    corner = torch.minimum((position - side / 2).clamp_min(0), last)
+    height, width = boxes.shape[1:3]
+    corner = torch.minimum((position - side / 2).clamp_min(0), position.new_tensor([width - 1, height - 1]))
     (left, top), (x, y) = corner.long().unbind(dim=-1), corner.frac().to(boxes)[..., None].unbind(dim=1)
-    right, bottom = (left + 1).clamp_max(boxes.shape[1] - 1), (top + 1).clamp_max(boxes.shape[0] - 1)
-    upper, lower = (boxes[row, left].lerp(boxes[row, right], x) for row in (top, bottom))
+    right, bottom = (left + 1).clamp_max(width - 1), (top + 1).clamp_max(height - 1)
+    upper, lower = (boxes[view, row, left].lerp(boxes[view, row, right], x) for row in (top, bottom))
     return upper.lerp(lower, y)
 
 
-def _patch_means(image: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
-    """Means [M, C] of an image [h, w, C] over squares around pixels [M], of these sides [M], cut off at the frame."""
-    height, width = image.shape[:2]
-    sums = nn.functional.pad(image.double().cumsum(0).cumsum(1), (0, 0, 1, 0, 1, 0))
+def _patch_means(images: Tensor, view: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
+    """Means [M, C] of images [V, h, w, C] of views [M] over squares around pixels [M], of these sides [M], cut off at
+    the frame."""
+    height, width = images.shape[1:3]
+    sums = nn.functional.pad(images.double().cumsum(1).cumsum(2), (0, 0, 1, 0, 1, 0))
     place = torch.stack([pixel % width, pixel // width], dim=-1)
     side = side[:, None].round().clamp_max(2 * max(height, width))
     first = (place + 0.5 - side / 2).round().long()
     last = (first + side.long()).minimum(place.new_tensor([width, height]))
     (left, top), (right, bottom) = first.clamp_min(0).unbind(dim=-1), last.unbind(dim=-1)
-    total = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
+    total = sums[view, bottom, right] - sums[view, top, right] - sums[view, bottom, left] + sums[view, top, left]
     return (total / ((right - left) * (bottom - top))[:, None]).float()
 
 

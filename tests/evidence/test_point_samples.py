@@ -110,20 +110,29 @@ def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
     assert (samples.patch[near] - samples.patch[far]).abs().max() < 0.02
 
 
-def test_many_views_are_sampled_as_each_by_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also where they are more than are projected at once, and photos of different types."""
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_many_views_are_sampled_as_each_by_itself(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
+    """Also where they are more than are projected at once, some have masks, and photos are of different types."""
     monkeypatch.setattr(point_samples, "VIEWS_AT_ONCE", 2)
+    monkeypatch.setattr(point_samples, "_photos_at_once", lambda *_: at_once)
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(300, 3, generator=generator) * torch.tensor([4.0, 4.0, 3.0]) + torch.tensor([-2.0, -2.0, 1.0])
     types = [torch.uint8, torch.float32, torch.uint16, torch.uint8, torch.float32]
-    views = [view(coordinates(dtype), x=0.3 * number) for number, dtype in enumerate(types)]
-    together = sample_points(points, views)
+    masks = [None, None, torch.arange(60).expand(40, 60) % 20 > 1, None, None]
+    views = [
+        view(coordinates(dtype), x=0.3 * number, mask=mask)
+        for number, (dtype, mask) in enumerate(zip(types, masks, strict=True))
+    ]
+    guide = torch.full((40, 60, 4), 0.1)
+    together = sample_points(points, views, guide)
+    assert together.patch is not None
     for number, each in enumerate(views):
-        alone, own = sample_points(points, [each]), together.view == number
+        alone, own = sample_points(points, [each], guide), together.view == number
         assert 50 < len(alone.point) < 150  # some are hidden, and some beside the frame
         assert together.point[own].tolist() == alone.point.tolist()
         assert together.pixel[own].tolist() == alone.pixel.tolist()
         torch.testing.assert_close(together.color[own], alone.color)
+        assert together.patch[own].isfinite().all()
 
 
 def test_patches_belong_to_the_points_that_a_mask_leaves() -> None:
