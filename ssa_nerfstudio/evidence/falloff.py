@@ -105,9 +105,7 @@ def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
         centered = columns - (summed(point, weight * columns, len(known)) / total)[point]
         rest = values - (summed(point, weight * values, len(known)) / total)[point]
         weighted = weight * centered
-        normal, right = weighted.T @ centered + damping.diag(), weighted.T @ rest
-        # On the CPU: so small that it takes longer to load a GPU's solver.
-        solution = torch.linalg.solve(normal.cpu(), right.cpu()).to(rest)
+        solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
         rest -= centered @ solution
         weight = 1 / (1 + (rest / (OUTLIER_SCALE * robust_deviation(rest))).square())
     return solution.flatten()[: modes.shape[1]]
