@@ -91,18 +91,13 @@ def blend(projected: Projected, channels: Tensor, cameras: Cameras, options: Ren
         width,
         height,
         TILE,
-        *_tile_lists(projected, width, height),
+        *tile_lists(*projected, width, height),
         backgrounds=backgrounds,
         absgrad=options.absgrad,
     )
     if options.render_mode.endswith("ED"):
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], dim=-1)
     return image, alpha
-
-
-def _tile_lists(projected: Projected, width: int, height: int) -> tuple[Tensor, Tensor]:
-    means2d, conics, alphas, depths, radii = (each.detach() for each in projected)
-    return tile_lists(means2d, conics, alphas, depths, radii, width, height)
 
 
 class Blending:
@@ -123,7 +118,7 @@ class Blending:
         size, absgrad = (cameras.width, cameras.height), options.absgrad
         splats = projected.means2d, projected.conics, channels, projected.alphas
         with torch.no_grad():
-            lists = _tile_lists(projected, *size)
+            lists = tile_lists(*projected, *size)
             found = _RasterizeToPixels.forward(self, *splats, *(None, None), *size, TILE, *lists, absgrad)  # pyright: ignore
         self.image, self.alpha = (each.requires_grad_() for each in found)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib.util
 import math
 
+import torch
 from gsplat import isect_offset_encode, isect_tiles
 from torch import Tensor
 
@@ -18,6 +19,7 @@ from ssa_nerfstudio.rasterization.constants import TILE
 _TRITON = importlib.util.find_spec("triton") is not None
 
 
+@torch.no_grad()
 def tile_lists(
     means2d: Tensor, conics: Tensor, alphas: Tensor, depths: Tensor, radii: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:

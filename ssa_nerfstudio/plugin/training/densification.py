@@ -130,7 +130,7 @@ class MarkovChainMonteCarlo(MCMCStrategy):
     """Relocate Gaussians that are not finite, and revive a scene in which all are dead."""
 
     def __post_init__(self) -> None:
-        repair_mcmc()  # also where there is CUDA: the training may run on the CPU
+        repair_mcmc()
 
     def initialize_state(self, scene_scale: float = 1.0) -> dict[str, Any]:
         """State of the strategy; the scene's scale plays no part in it."""
