@@ -9,7 +9,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import random
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,13 +16,12 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.utils import writer
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
-from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 ALIVE = 0.005
 """Opacity above which a Gaussian is alive (MCMC's smallest)."""
@@ -66,36 +64,27 @@ class Command:
     def _train(self, overlay: str, guards: bool) -> dict[str, Any]:
         model = {"overlay": overlay, "guards": guards, "cap_max": self.cap_max}
         config = configure("ssa-splatfacto-mcmc", self.data, self.output / "runs", self.steps, model, self.scale_factor)
-        random.seed(0)
-        np.random.seed(0)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
-        torch.manual_seed(0)
-        config.set_timestamp()
-        config.viewer.quit_on_train_completion = True
-        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        names, notes = list(trainer.pipeline.model.gauss_params), []
+        failure, notes = None, []
+        with no_event_writers_left():
+            trainer = prepared_trainer(config)
 
-        @torch.no_grad()
-        def note(step: int) -> None:
-            if step % self.every:
-                return
-            params = trainer.pipeline.model.gauss_params
-            squares = torch.stack([p.grad.square().sum() for p in params.values() if p.grad is not None])
-            finite = [torch.isfinite(p).all().float() for p in params.values()]
-            alive = (torch.sigmoid(params["opacities"]) > ALIVE).float().mean()
-            notes.append(torch.stack([params["scales"].max().exp(), alive, squares.sum().sqrt(), *finite]))
+            @torch.no_grad()
+            def note(step: int) -> None:
+                if step % self.every:
+                    return
+                params = trainer.pipeline.model.gauss_params
+                squares = torch.stack([p.grad.square().sum() for p in params.values() if p.grad is not None])
+                finite = [torch.isfinite(p).all().float() for p in params.values()]
+                alive = (torch.sigmoid(params["opacities"]) > ALIVE).float().mean()
+                notes.append(torch.stack([params["scales"].max().exp(), alive, squares.sum().sqrt(), *finite]))
 
-        # Before the densification, which replaces these parameters by new ones without gradients.
-        trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
-        failure = None
-        try:
-            trainer.train()
-        except TrainingError as failed:
-            failure = str(failed)
-        finally:
-            writer.EVENT_WRITERS.clear()
-            writer.EVENT_STORAGE.clear()
-            writer.GLOBAL_BUFFER.clear()
+            # Before the densification, which replaces these parameters by new ones without gradients.
+            trainer.callbacks.insert(0, TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
+            try:
+                trainer.train()
+            except TrainingError as failed:
+                failure = str(failed)
+        names = list(trainer.pipeline.model.gauss_params)
         table = torch.stack(notes).cpu().numpy().astype(float)
         steps = (np.arange(len(table)) * self.every).tolist()
         series = {name: [v if math.isfinite(v) else None for v in table[:, k]] for k, name in enumerate(PANELS)}

@@ -20,6 +20,7 @@ from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
 from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY
@@ -48,7 +49,7 @@ class Command:
         """Train in turns and print one line."""
         if CHECK_EVERY % self.block or self.pairs < 4:
             raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 4")
-        with TemporaryDirectory() as folder:
+        with TemporaryDirectory() as folder, no_event_writers_left():
             training = self._training(Path(folder))
             for _ in range(self.grow):
                 training.step()
@@ -82,10 +83,7 @@ class Command:
         steps = self.grow + self.pairs * CHECK_EVERY
         config = configure(self.method, self.data, output, steps, model, self.scale_factor)
         config.scale_schedules = False
-        torch.manual_seed(0)
-        config.set_timestamp()
-        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+        trainer: SSATrainer = prepared_trainer(config)
         trainer.pipeline.train()
         return Training(trainer)
 

@@ -11,25 +11,24 @@ from __future__ import annotations
 import copy
 import json
 import os
-import random
 import shutil
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
-import numpy as np
 import torch
 from gsplat.strategy import ops
 from nerfstudio.configs.method_configs import all_methods
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.utils import writer
+from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
 from ssa_nerfstudio.plugin.methods import METHODS
 
 FIRST, LAST = 699, 1099
@@ -73,12 +72,23 @@ class Command:
             InputError: the dataset cannot be trained on.
         """
         Transforms.read(self.data)
+        with TemporaryDirectory() as folder, no_event_writers_left():
+            trainer = prepared_trainer(self._config(Path(folder)))
+            if self.gaussians:
+                trainer.callbacks.append(_growth(trainer, self.gaussians))
+            if self.profile is not None:
+                trainer.config.max_num_iterations = PROFILED[1] + 1
+                _write_profile(trainer, self.profile)
+            else:
+                self._time(trainer)
+
+    def _config(self, output: Path) -> TrainerConfig:
         config = copy.deepcopy((all_methods | METHODS)[self.method])
         config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", LAST + 1, 10 * LAST
         config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
         config.logging.local_writer.enable = False
-        config.output_dir = Path(tempfile.mkdtemp())
-        data = self.data if self.enlarge == 1 else _enlarged(self.data, self.enlarge, config.output_dir / "photos")
+        config.output_dir = output
+        data = self.data if self.enlarge == 1 else _enlarged(self.data, self.enlarge, output / "photos")
         config.data = config.pipeline.datamanager.data = data
         parser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
         config.pipeline.datamanager.dataparser = parser  # pyright: ignore[reportAttributeAccessIssue]
@@ -87,21 +97,10 @@ class Command:
         if self.method != "splatfacto":
             config.scale_schedules = False
             model.overlay = self.overlay  # pyright: ignore[reportAttributeAccessIssue]
-        random.seed(config.machine.seed)
-        np.random.seed(config.machine.seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
-        torch.manual_seed(config.machine.seed)
-        config.set_timestamp()
-        config.save_config()
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        trainer.config.viewer.quit_on_train_completion = True
-        writer.EVENT_WRITERS.clear()  # tensorboard's; splatfacto's default, the viewer, has none
-        if self.gaussians:
-            trainer.callbacks.append(_growth(trainer, self.gaussians))
-        if self.profile is not None:
-            trainer.config.max_num_iterations = PROFILED[1] + 1
-            _write_profile(trainer, self.profile)
-            return
+        return config
+
+    def _time(self, trainer: Any) -> None:
+        """Train, and print a line for each value of SSA_CUDA_GRAPHS."""
         last = FIRST + 4 * len(GRAPHS) * TURN if self.alternate else LAST
         trainer.config.max_num_iterations = last + 1
         times: dict[int, float] = {}

@@ -6,19 +6,19 @@ hundred steps use the other lists; the device is synchronized in between. Needs 
 
 from __future__ import annotations
 
-import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.utils import writer
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.plugin.training.schedules import DEFAULT_LENGTH
 from ssa_nerfstudio.rasterization import cuda, tile_lists
@@ -47,13 +47,13 @@ class Command:
         if not torch.cuda.is_available():
             raise InputError("there is no CUDA", "a CPU's rasterizer has lists of its own")
         settings = {"strategy": self.strategy, "overlay": "on"}
-        config = configure("ssa-splatfacto", self.data, Path(tempfile.mkdtemp()), DEFAULT_LENGTH, settings)
-        config.set_timestamp()
-        config.save_config()
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        writer.EVENT_WRITERS.clear()
-        trainer.config.max_num_iterations = self.steps
+        with TemporaryDirectory() as folder, no_event_writers_left():
+            config = configure("ssa-splatfacto", self.data, Path(folder), DEFAULT_LENGTH, settings)
+            trainer = prepared_trainer(config)
+            trainer.config.max_num_iterations = self.steps
+            self._time(trainer)
+
+    def _time(self, trainer: Any) -> None:
         model = trainer.pipeline.model
         turns: dict[bool, list[str]] = {False: [], True: []}
         entries: dict[bool, int] = {}

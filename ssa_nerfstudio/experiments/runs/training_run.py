@@ -1,8 +1,7 @@
-"""One training through nerfstudio's own trainer, evaluated and timed: the one place here that starts it."""
+"""One training through nerfstudio's own trainer, evaluated and timed."""
 
 from __future__ import annotations
 
-import random
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -10,15 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-import numpy as np
 import torch
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.utils import writer
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
 from ssa_nerfstudio.experiments.runs.machine import versions
+from ssa_nerfstudio.experiments.runs.prepared_trainer import begin_run, no_event_writers_left, set_up_trainer
 from ssa_nerfstudio.experiments.runs.run_timing import StepClock, TimedDatamanager, TimedPipeline, mean_metrics
 from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
 from ssa_nerfstudio.plugin.evaluation import view_metrics_without_flip
@@ -58,6 +56,7 @@ class Outcome:
         return asdict(self)
 
 
+@no_event_writers_left()
 def train_and_evaluate(
     config: SSATrainerConfig,
     on_step: Callable[[int], None] = lambda step: None,
@@ -82,20 +81,13 @@ def train_and_evaluate(
         Diverged: a Gaussian is not finite, none can be seen any more, or the guards gave the training up.
     """
     start = time.perf_counter()
-    seed = config.machine.seed
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
-    torch.manual_seed(seed)
-    config.set_timestamp()
     quiet, CONSOLE.quiet = CONSOLE.quiet, True
     flips = FlipProcesses(flip_processes)
     try:
-        config.save_config()
+        begin_run(config)
         # Not in config.yml, which other commands load.
         config.pipeline._target, config.pipeline.datamanager._target = TimedPipeline, TimedDatamanager
-        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        writer.EVENT_WRITERS.clear()  # not read by anything here
+        trainer: SSATrainer = set_up_trainer(config)
         pipeline = cast(TimedPipeline, trainer.pipeline)
         pipeline.read_photos(test_scale)
         judge = partial(evaluate, pipeline, flips, region)
@@ -103,7 +95,6 @@ def train_and_evaluate(
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], clock.after_step))
         if clock.cuda:
             torch.cuda.reset_peak_memory_stats()
-        trainer.config.viewer.quit_on_train_completion = True
         setup = time.perf_counter() - start
         clock.start()
         _train(trainer)
@@ -113,10 +104,6 @@ def train_and_evaluate(
     finally:
         flips.close()
         CONSOLE.quiet = quiet
-        # nerfstudio keeps its event writers in globals: the next run in this process starts with none.
-        writer.EVENT_WRITERS.clear()
-        writer.EVENT_STORAGE.clear()
-        writer.GLOBAL_BUFFER.clear()
     outcome = Outcome(
         metrics=mean_metrics(views),
         seconds={
