@@ -7,7 +7,6 @@ for the device between blocks; its own clock tells the times. Prints their ratio
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,6 +18,7 @@ from nerfstudio.engine.callbacks import TrainingCallbackLocation
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
+from ssa_nerfstudio.experiments.runs.lap import Lap
 from ssa_nerfstudio.experiments.runs.machine import versions
 from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
@@ -86,30 +86,6 @@ class Command:
         trainer: SSATrainer = prepared_trainer(config)
         trainer.pipeline.train()
         return Training(trainer)
-
-
-class Lap:
-    """A stretch of work between now and `end`, by the device's clock where there is one, else by the host's."""
-
-    def __init__(self) -> None:
-        self._events = [torch.cuda.Event(enable_timing=True) for _ in range(2)] if torch.cuda.is_available() else []
-        self._start = self._mark(0)
-
-    def _mark(self, which: int) -> float:
-        if self._events:
-            self._events[which].record()
-        return time.perf_counter()
-
-    def end(self) -> None:
-        """Until here."""
-        self._seconds = self._mark(1) - self._start
-
-    def seconds(self) -> float:
-        """How long it took; waits for the device."""
-        if not self._events:
-            return self._seconds
-        self._events[1].synchronize()
-        return self._events[0].elapsed_time(self._events[1]) / 1e3
 
 
 class Training:

@@ -1,29 +1,29 @@
 """Milliseconds of a step with gsplat's lists of tiles and with ours: `python benchmarks/tile_list_time.py --data DIR`
 
 The default's first steps, as long as MCMC takes to reach its largest number of Gaussians. From step 1500 on each
-hundred steps use the other lists; the device is synchronized in between. Needs CUDA.
+hundred steps use the other lists, gsplat's first. The device's own clock tells the times, and nothing waits for it.
+Needs CUDA and Triton.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
-from ssa_nerfstudio.plugin.training.schedules import DEFAULT_LENGTH
+from ssa_nerfstudio.experiments.runs.lap import Lap
 from ssa_nerfstudio.rasterization import cuda, tile_lists
 
 FIRST, TURN = 1500, 100
+"""The first step of the first turn, and the steps of each."""
+LEAST = FIRST + 2 * TURN
+"""Steps of a training in which both kinds of lists have a turn."""
 
 
 @dataclass
@@ -35,17 +35,26 @@ class Command:
     strategy: Literal["mcmc", "adc"] = "mcmc"
     """Densification."""
     steps: int = 4000
-    """Steps to train, of the default's."""
+    """Steps to train, of the default's; at least 1700."""
 
     def run(self) -> None:
         """Train, and print a line for each kind of lists and one for refinements.
 
         Raises:
-            InputError: the dataset cannot be trained on, or there is no CUDA.
+            InputError: there are too few steps for a turn of each kind, the dataset cannot be trained on, or CUDA or
+                Triton is missing.
         """
+        if self.steps < LEAST:
+            raise InputError(f"--steps must be at least {LEAST}, so that both lists have a turn, got {self.steps}")
         Transforms.read(self.data)
         if not torch.cuda.is_available():
             raise InputError("there is no CUDA", "a CPU's rasterizer has lists of its own")
+        if not tile_lists._TRITON:
+            raise InputError("our lists need Triton, which is not installed", "pip install triton")
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure
+        from ssa_nerfstudio.plugin.training.schedules import DEFAULT_LENGTH
+
         settings = {"strategy": self.strategy, "overlay": "on"}
         with TemporaryDirectory() as folder, no_event_writers_left():
             config = configure("ssa-splatfacto", self.data, Path(folder), DEFAULT_LENGTH, settings)
@@ -54,10 +63,14 @@ class Command:
             self._time(trainer)
 
     def _time(self, trainer: Any) -> None:
+        from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
         model = trainer.pipeline.model
-        turns: dict[bool, list[str]] = {False: [], True: []}
+        turns: dict[bool, list[tuple[Lap, int]]] = {False: [], True: []}
         entries: dict[bool, int] = {}
-        refined, began, plain = [], [0.0], cuda.tile_lists
+        refinements: list[Lap] = []
+        running: list[Lap] = []
+        plain, post_backward = cuda.tile_lists, model.strategy.step_post_backward
 
         def counted(*given):
             offsets, ids = plain(*given)
@@ -65,32 +78,30 @@ class Command:
             return offsets, ids
 
         def note(step: int) -> None:
-            if step >= FIRST and step % TURN == TURN - 1:
-                torch.cuda.synchronize()
-                if began[0]:
-                    spent = 1e3 * (time.perf_counter() - began[0]) / TURN
-                    turns[tile_lists._TRITON].append(f"{spent:.2f} ({model.num_points:,})")
-                tile_lists._TRITON = not tile_lists._TRITON
-                began[0] = time.perf_counter()
+            if step + 1 < FIRST or (step + 1 - FIRST) % TURN:
+                return
+            if running:
+                lap = running.pop()
+                lap.end()
+                turns[tile_lists._TRITON].append((lap, model.num_points))
+            tile_lists._TRITON = not tile_lists._TRITON
+            running.append(Lap())
 
-        def refine(*, step: int, **given) -> None:
-            due = step >= FIRST and step % model.strategy.refine_every == 0
-            if due:
-                torch.cuda.synchronize()
-            before = time.perf_counter()
-            post_backward(step=step, **given)
-            if due:
-                torch.cuda.synchronize()
-                refined.append(1e3 * (time.perf_counter() - before))
+        def refine(**given) -> None:
+            lap = Lap()
+            post_backward(**given)
+            lap.end()
+            if given["step"] >= FIRST and given["step"] % model.strategy.refine_every == 0:
+                refinements.append(lap)
 
-        post_backward, model.strategy.step_post_backward = model.strategy.step_post_backward, refine
-        cuda.tile_lists = counted
+        cuda.tile_lists, model.strategy.step_post_backward = counted, refine
         trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
         trainer.train()
         for ours, found in turns.items():
-            print(f"{'our' if ours else 'gsplat'} lists, ms a step (Gaussians): {', '.join(found)}")
+            each = (f"{1e3 * lap.seconds() / TURN:.2f} ({gaussians:,})" for lap, gaussians in found)
+            print(f"{'our' if ours else 'gsplat'} lists, ms a step (Gaussians): {', '.join(each)}")
             print(f"  entries in the last view: {entries[ours]:,}")
-        print(f"a refinement: {sum(refined) / max(1, len(refined)):.1f} ms")
+        print(f"a refinement: {1e3 * sum(lap.seconds() for lap in refinements) / max(1, len(refinements)):.1f} ms")
 
 
 if __name__ == "__main__":

@@ -50,6 +50,9 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
         (["start_time.py", "--data", "x", "--rounds", "0"], 2, "--rounds must be at least 1, got 0"),
         (["start_time.py", "--data", "x", "--methods"], 2, "no method is given"),
         (["initialization_time.py", "--data", "nowhere"], 2, "nowhere"),
+        (["tile_list_time.py", "--help"], 0, "usage: python benchmarks/tile_list_time.py"),
+        (["tile_list_time.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
+        (["tile_list_time.py", "--data", "x", "--steps", "1699"], 2, "--steps must be at least 1700"),
     ],
 )
 def test_a_script_ends_as_a_command_does(arguments, code, said):
