@@ -15,13 +15,11 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
 from ssa_nerfstudio.cli import run_script
-from ssa_nerfstudio.errors import TrainingError
+from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.experiments.runs.machine import versions
-from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
 
 ALIVE = 0.005
 """Opacity above which a Gaussian is alive (MCMC's smallest)."""
@@ -50,7 +48,14 @@ class Command:
     """Steps between two recorded values."""
 
     def run(self) -> None:
-        """Train, write, draw."""
+        """Train, write, draw.
+
+        Raises:
+            InputError: an option is out of range, or the dataset cannot be trained on.
+        """
+        if self.every < 1:
+            raise InputError(f"--every must be at least 1, got {self.every}")
+        Transforms.read(self.data)
         self.output.mkdir(parents=True, exist_ok=True)
         for overlay, guards in itertools.product(self.overlay, self.guards):
             run = self._train(overlay, guards)
@@ -62,6 +67,11 @@ class Command:
         draw(runs, self.output / "divergence.png")
 
     def _train(self, overlay: str, guards: bool) -> dict[str, Any]:
+        from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure
+
         model = {"overlay": overlay, "guards": guards, "cap_max": self.cap_max}
         config = configure("ssa-splatfacto-mcmc", self.data, self.output / "runs", self.steps, model, self.scale_factor)
         failure, notes = None, []

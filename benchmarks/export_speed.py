@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from nerfstudio.scripts.exporter import ExportGaussianSplat
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
@@ -36,6 +35,8 @@ class Command:
         """
         if self.gaussians < 1:
             raise InputError(f"--gaussians must be at least 1, got {self.gaussians}")
+        from nerfstudio.scripts.exporter import ExportGaussianSplat
+
         self.output.mkdir(parents=True, exist_ok=True)
         generator = torch.Generator().manual_seed(0)
         shapes = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (1,), "features_dc": (3,)}

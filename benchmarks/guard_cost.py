@@ -10,20 +10,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from nerfstudio.engine.callbacks import TrainingCallbackLocation
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
 from ssa_nerfstudio.experiments.runs.lap import Lap
 from ssa_nerfstudio.experiments.runs.machine import versions
-from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
-from ssa_nerfstudio.plugin.trainer import SSATrainer
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY
+
+if TYPE_CHECKING:
+    from ssa_nerfstudio.plugin.trainer import SSATrainer
 
 
 @dataclass
@@ -46,9 +47,16 @@ class Command:
     """Photos are resized by this."""
 
     def run(self) -> None:
-        """Train in turns and print one line."""
-        if CHECK_EVERY % self.block or self.pairs < 4:
+        """Train in turns and print one line.
+
+        Raises:
+            InputError: an option is out of range, or the dataset cannot be trained on.
+        """
+        if self.block < 1 or CHECK_EVERY % self.block or self.pairs < 4:
             raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 4")
+        Transforms.read(self.data)
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left
+
         with TemporaryDirectory() as folder, no_event_writers_left():
             training = self._training(Path(folder))
             for _ in range(self.grow):
@@ -78,6 +86,9 @@ class Command:
         return [sum(lap.seconds() for lap in laps[guarded]) for guarded in (False, True)]
 
     def _training(self, output: Path) -> Training:
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import prepared_trainer
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure
+
         model = {"overlay": self.overlay, "num_downscales": 0, "stop_split_at": self.grow, "mcmc_stop_at": self.grow}
         model["strategy"] = "mcmc" if self.method.endswith("mcmc") else "adc"
         steps = self.grow + self.pairs * CHECK_EVERY
@@ -92,7 +103,11 @@ class Training:
     """A training whose guards can be switched off and on as it goes."""
 
     def __init__(self, trainer: SSATrainer) -> None:
+        from nerfstudio.engine.callbacks import TrainingCallbackLocation
+
         self.trainer, self.steps = trainer, 0
+        self._before = TrainingCallbackLocation.BEFORE_TRAIN_ITERATION
+        self._after = TrainingCallbackLocation.AFTER_TRAIN_ITERATION
         self._guard = trainer.optimizers.guard
 
     def switch(self, guarded: bool) -> None:
@@ -105,10 +120,10 @@ class Training:
     def step(self) -> dict[str, torch.Tensor]:
         """Train one step, as nerfstudio's loop does: the terms of its loss."""
         for callback in self.trainer.callbacks:
-            callback.run_callback_at_location(self.steps, TrainingCallbackLocation.BEFORE_TRAIN_ITERATION)
+            callback.run_callback_at_location(self.steps, self._before)
         _, losses, _ = self.trainer.train_iteration(self.steps)
         for callback in self.trainer.callbacks:
-            callback.run_callback_at_location(self.steps, TrainingCallbackLocation.AFTER_TRAIN_ITERATION)
+            callback.run_callback_at_location(self.steps, self._after)
         self.steps += 1
         return losses
 

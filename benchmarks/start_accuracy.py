@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
 from ssa_nerfstudio import evidence
 from ssa_nerfstudio.cli import run_script
@@ -29,9 +28,7 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initializ
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
-from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
@@ -131,6 +128,11 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     """Errors of the start with each variant of the constants."""
     if not variants:
         return
+    from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
+
+    from ssa_nerfstudio.experiments.runs.run_configuration import configure
+    from ssa_nerfstudio.plugin.view_geometry import view_matrix
+
     config = configure("ssa-splatfacto", path, Path("outputs"), 1)
     manager = config.pipeline.datamanager.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
     assert isinstance(manager, FullImageDatamanager)

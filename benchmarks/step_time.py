@@ -13,23 +13,22 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import torch
 from gsplat.strategy import ops
-from nerfstudio.configs.method_configs import all_methods
-from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.engine.trainer import TrainerConfig
 from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.transforms import Transforms
-from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
-from ssa_nerfstudio.plugin.methods import METHODS
+from ssa_nerfstudio.errors import InputError
+
+if TYPE_CHECKING:
+    from nerfstudio.engine.trainer import TrainerConfig
 
 FIRST, LAST = 699, 1099
 """Steps between which the time is taken: after Triton's compilation and the first refinement, at step 600, which takes
@@ -69,13 +68,19 @@ class Command:
         """Train 1100 steps and print one line; or 680 and write a file.
 
         Raises:
-            InputError: the dataset cannot be trained on.
+            InputError: the dataset cannot be trained on, or the method splits no Gaussians, or lacks CUDA.
         """
+        if self.gaussians and self.method == "ssa-splatfacto-mcmc":
+            raise InputError("MCMC splits no Gaussians", "leave out --gaussians")
         Transforms.read(self.data)
+        if self.method == "splatfacto" and not torch.cuda.is_available():
+            raise InputError("there is no CUDA, without which splatfacto cannot train", "choose another --method")
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+
         with TemporaryDirectory() as folder, no_event_writers_left():
             trainer = prepared_trainer(self._config(Path(folder)))
             if self.gaussians:
-                trainer.callbacks.append(_growth(trainer, self.gaussians))
+                _after_each_step(trainer, _growth(trainer, self.gaussians))
             if self.profile is not None:
                 trainer.config.max_num_iterations = PROFILED[1] + 1
                 _write_profile(trainer, self.profile)
@@ -83,6 +88,11 @@ class Command:
                 self._time(trainer)
 
     def _config(self, output: Path) -> TrainerConfig:
+        from nerfstudio.configs.method_configs import all_methods
+        from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+        from ssa_nerfstudio.plugin.methods import METHODS
+
         config = copy.deepcopy((all_methods | METHODS)[self.method])
         config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", LAST + 1, 10 * LAST
         config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
@@ -115,7 +125,7 @@ class Command:
                 if self.alternate:
                     os.environ["SSA_CUDA_GRAPHS"] = [*GRAPHS.values()][(step - FIRST) // TURN % len(GRAPHS)]
 
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
+        _after_each_step(trainer, note)
         trainer.train()
         for number, graphs in enumerate(GRAPHS if self.alternate else [""]):
             turns = range(FIRST + number * TURN, last, len(GRAPHS) * TURN) if self.alternate else [FIRST]
@@ -146,7 +156,14 @@ def _enlarged(data: Path, factor: float, folder: Path) -> Path:
     return folder
 
 
-def _growth(trainer: Any, count: int) -> TrainingCallback:
+def _after_each_step(trainer: Any, call: Callable[[int], None]) -> None:
+    """Let a training call this after every step, with the step's number from 0."""
+    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+
+    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], call))
+
+
+def _growth(trainer: Any, count: int) -> Callable[[int], None]:
     """What splits the Gaussians, those with the largest opacity last, and ends their densification."""
 
     def grow(step: int) -> None:
@@ -159,7 +176,7 @@ def _growth(trainer: Any, count: int) -> TrainingCallback:
             ops.split(model.gauss_params, optimizers, model.strategy_state, rank < count - model.num_points)
         model.strategy.refine_stop_iter = GROWN
 
-    return TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], grow)
+    return grow
 
 
 def _write_profile(trainer: Any, path: Path) -> None:
@@ -174,7 +191,7 @@ def _write_profile(trainer: Any, path: Path) -> None:
                 torch.cuda.synchronize()
             profiler.stop()
 
-    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
+    _after_each_step(trainer, note)
     trainer.train()
     found, steps = profiler.key_averages(), PROFILED[1] - PROFILED[0]
     names = ("launch", "memcpyasync", "memsetasync", "synchronize")

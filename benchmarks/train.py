@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ssa_nerfstudio.cli import run_script
-from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
-from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+from ssa_nerfstudio.data.transforms import Transforms
 
 
 @dataclass
@@ -29,7 +28,15 @@ class Command:
     """Photos are resized by this."""
 
     def run(self) -> None:
-        """Train, evaluate, write."""
+        """Train, evaluate, write.
+
+        Raises:
+            InputError: the model has no such setting, or the dataset cannot be trained on.
+        """
+        Transforms.read(self.data)
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
+        from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+
         folder = self.output.with_suffix("")
         model = model_settings(self.settings)
         config = configure(self.method, self.data, folder, self.steps, model, self.scale_factor)

@@ -50,9 +50,22 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
         (["start_time.py", "--data", "x", "--rounds", "0"], 2, "--rounds must be at least 1, got 0"),
         (["start_time.py", "--data", "x", "--methods"], 2, "no method is given"),
         (["initialization_time.py", "--data", "nowhere"], 2, "nowhere"),
+        (["divergence.py", "--data", "nowhere", "--output", "nowhere"], 2, "nowhere/transforms.json does not exist"),
+        (["divergence.py", "--data", "x", "--output", "nowhere", "--every", "0"], 2, "--every must be at least 1"),
+        (["guard_cost.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
+        (["guard_cost.py", "--data", "x", "--block", "0"], 2, "--block must divide 100"),
+        (["step_time.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
+        (
+            ["step_time.py", "--data", "x", "--method", "ssa-splatfacto-mcmc", "--gaussians", "9"],
+            2,
+            "MCMC splits no Gaussians",
+        ),
         (["tile_list_time.py", "--help"], 0, "usage: python benchmarks/tile_list_time.py"),
         (["tile_list_time.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
         (["tile_list_time.py", "--data", "x", "--steps", "1699"], 2, "--steps must be at least 1700"),
+        (["start_accuracy.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
+        (["export_speed.py", "--output", "nowhere", "--gaussians", "0"], 2, "--gaussians must be at least 1, got 0"),
+        (["train.py", "--data", "nowhere", "--output", "nowhere"], 2, "nowhere/transforms.json does not exist"),
     ],
 )
 def test_a_script_ends_as_a_command_does(arguments, code, said):
@@ -61,6 +74,7 @@ def test_a_script_ends_as_a_command_does(arguments, code, said):
     assert done.returncode == code
     assert said in (done.stderr if code else done.stdout)
     assert len(done.stderr.splitlines()) == (1 if code else 0)
+    assert not (FOLDER.parent / "nowhere").exists()
 
 
 @pytest.mark.slow
