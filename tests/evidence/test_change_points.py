@@ -138,3 +138,12 @@ def test_each_interval_has_its_own_verdict_and_photos_are_read_again_only_where_
     assert detection.views == 40
     assert detection.mask[20:36, 12:84].float().mean() > 0.5
     assert not detection.mask[45:].any()
+
+
+@pytest.mark.parametrize("values", [1, 10_000])
+def test_intervals_are_compared_in_groups_of_any_size(monkeypatch, values):
+    """One by one, and a few at a time; all of this small capture are one group otherwise."""
+    photos = capture(28)
+    shown = photos[:18] + [logo(photo) for photo in photos[18:]]
+    monkeypatch.setattr("ssa_nerfstudio.evidence.change_points.VALUES_AT_ONCE", values)
+    assert found(shown) == [18]

@@ -9,7 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.layer_estimate import SMOOTHNESS_FLOOR, LayerEstimate, _smoothness, estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import (
+    SMOOTHNESS_FLOOR,
+    LayerEstimate,
+    _smoothness,
+    _start,
+    estimate_layers,
+)
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
 HEIGHT, WIDTH = 36, 48
@@ -131,22 +137,28 @@ def test_a_calm_area_that_hides_the_scene_wherever_points_tell_hides_it_everywhe
     assert found.transmittance[core].mean() < 0.05
 
 
-def test_a_thumb_in_changing_light_leaves_a_plain_floor_beside_it_clear() -> None:
-    """The thumb varies more than the floor: by the photos' variance alone the floor's points would have its color."""
+@pytest.mark.parametrize(("floors", "share", "change"), [(100, 0.2, 0.2), (300, 0.3, 0.165)])
+def test_a_thumb_in_changing_light_leaves_a_plain_floor_beside_it_clear(
+    floors: int, share: float, change: float
+) -> None:
+    """The thumb varies more than the floor: by the photos' variance alone the floor's points would have its color.
+
+    Where it often hides many of these points, one turn of colors and hiding pixels leaves half of them with it.
+    """
     generator = torch.Generator().manual_seed(0)
-    views, walls, floors = 60, 500, 100
+    views, walls = 60, 500
     colors = torch.cat([BRIGHTEST * torch.rand(walls, 3, generator=generator), torch.full((floors, 3), 0.2)])
     colors[walls:] += 0.15 * torch.rand(floors, 3, generator=generator)
     thumb, floor = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool), torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
     thumb[12:, 32:], floor[24:, 16:32] = True, True
     behind, beside, elsewhere = (each.flatten().nonzero()[:, 0] for each in (thumb, floor, ~floor))
     point, view = torch.arange(walls + floors).repeat(views), torch.arange(views).repeat_interleave(walls + floors)
-    hidden = torch.rand(len(point), generator=generator) < 0.2
+    hidden = torch.rand(len(point), generator=generator) < share
     places = [
         each[torch.randint(len(each), (len(point),), generator=generator)] for each in (behind, beside, elsewhere)
     ]
     pixel = torch.where(hidden, places[0], torch.where(point < walls, places[2], places[1]))
-    light = 1 + 0.2 * torch.randn(views, 1, generator=generator)
+    light = 1 + change * torch.randn(views, 1, generator=generator)
     shown = torch.where(thumb.flatten()[pixel][:, None], torch.tensor([0.6, 0.4, 0.3]) * light[view], colors[point])
     shown = (shown + 0.01 * torch.randn(shown.shape, generator=generator)).clamp(0, 1)
     order = np.lexsort((shown.sum(dim=-1).numpy(), point.numpy()))
@@ -154,10 +166,42 @@ def test_a_thumb_in_changing_light_leaves_a_plain_floor_beside_it_clear() -> Non
     mean = torch.full((HEIGHT, WIDTH, 3), BRIGHTEST / 2)
     mean[thumb], mean[floor] = torch.tensor([0.6, 0.4, 0.3]), 0.275
     deviation = torch.full((HEIGHT, WIDTH, 1), 0.17)
-    deviation[thumb], deviation[floor] = 0.12, 0.045
+    deviation[thumb], deviation[floor] = 0.6 * change, 0.045
     found = estimate_layers(samples, mean, deviation, NOWHERE, NOWHERE)
     assert found.transmittance[thumb].mean() < 0.1
     assert found.transmittance[floor].mean() > 0.9
+
+
+@pytest.mark.parametrize(("through", "beside"), [(0.0, 0), (0.0, 4), (0.2, 4), (0.4, 0), (0.4, 4), (0.6, 4)])
+def test_samples_start_by_how_much_comes_through_where_they_are(through: float, beside: int) -> None:
+    """Some points are seen behind a dark mark but for few photos, which tell their colors, or but for none.
+
+    Where less than a third of the scene comes through, the few have the word, and where less than a half, samples are
+    compared with the photos' mean. All others go by the median of what the photos show.
+    """
+    generator = torch.Generator().manual_seed(0)
+    views, points, dark = 60, 300, torch.tensor([0.05, 0.1, 0.15])
+    mark, clear = (disc(0.02, radius)[..., 0] > 0.5 for radius in (0.4, 0.7))  # no window holds samples of both
+    marked, unmarked = mark.flatten().nonzero()[:, 0], (~clear).flatten().nonzero()[:, 0]
+    colors = BRIGHTEST * torch.rand(points, 3, generator=generator)
+    point, view = torch.arange(points).repeat_interleave(views), torch.arange(views).repeat(points)
+    behind = torch.where(point % 30 == 0, view >= beside, view % 4 == 0)
+    places = [each[torch.randint(len(each), (len(point),), generator=generator)] for each in (marked, unmarked)]
+    shown = torch.where(behind[:, None], through * colors[point] + (1 - through) * dark, colors[point])
+    shown = (shown + 0.01 * torch.randn(shown.shape, generator=generator)).clamp(0, 1)
+    pixel = torch.where(behind, *places)
+    samples = PointSamples(point, pixel, shown, points, (HEIGHT, WIDTH), view).ordered()
+    mean, deviation = torch.full((HEIGHT, WIDTH, 3), BRIGHTEST / 2), torch.full((HEIGHT, WIDTH, 1), 0.17)
+    mean[mark] = through * BRIGHTEST / 2 + (1 - through) * dark
+    deviation[mark] *= max(through, 0.05)
+    first, residual = _start(samples, mean, deviation)
+    expected = colors.clone()
+    if through > 1 / 3 or not beside:
+        expected[::30] = through * colors[::30] + (1 - through) * dark
+    torch.testing.assert_close(first, expected, atol=0.1, rtol=0)
+    opaque, behind = samples.color - mean.reshape(-1, 3)[samples.pixel], mark.flatten()[samples.pixel]
+    hiding = behind[:, None] & torch.tensor(through < 0.5)
+    torch.testing.assert_close(residual, torch.where(hiding, opaque, samples.color - first[samples.point]))
 
 
 def test_a_film_over_a_plain_part_of_the_scene_is_not_taken_for_opaque() -> None:

@@ -132,7 +132,8 @@ def test_many_views_are_sampled_as_each_by_itself(monkeypatch: pytest.MonkeyPatc
         assert together.point[own].tolist() == alone.point.tolist()
         assert together.pixel[own].tolist() == alone.pixel.tolist()
         torch.testing.assert_close(together.color[own], alone.color)
-        assert together.patch[own].isfinite().all()
+    monkeypatch.setattr(point_samples, "_photos_at_once", lambda *_: 1)
+    torch.testing.assert_close(together.patch, sample_points(points, views, guide).patch)
 
 
 def test_patches_belong_to_the_points_that_a_mask_leaves() -> None:
@@ -162,10 +163,14 @@ def test_samples_state_the_ratio_of_focal_lengths() -> None:
     assert sample_points(points, [stretched, stretched]).focal_ratio == pytest.approx(1.5)
 
 
-def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks() -> None:
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks(
+    monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
     """Of noise, around points in the frame's corners and beside a mask, under a gain for each channel."""
+    monkeypatch.setattr(point_samples, "_photos_at_once", lambda *_: at_once)
     generator = torch.Generator().manual_seed(0)
-    image = torch.randint(0, 256, (40, 60, 3), generator=generator, dtype=torch.uint8)
+    images = torch.randint(0, 256, (2, 40, 60, 3), generator=generator, dtype=torch.uint8)
     mask = torch.rand(40, 60, generator=generator) > 0.2
     gain = torch.tensor([0.5, 1.0, 2.0])
     place = torch.tensor([[0, 0], [59, 0], [0, 39], [59, 39], [30, 20], [20, 38], [57, 21]])
@@ -175,20 +180,22 @@ def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks() -> 
     back = torch.eye(4)
     back[2, 3] = 3.0  # the points are farther from there
     for seen in (None, mask):
-        first = View(image, seen, torch.eye(4), K, gain)
-        samples = sample_points(points, [first, View(image, None, back, K)], UNKNOWN[:40, :60])
+        views = [View(images[0], seen, torch.eye(4), K, gain), View(images[1], None, back, K)]
+        samples = sample_points(points, views, UNKNOWN[:40, :60])
         assert samples.patch is not None
-        own = (samples.view == 0).nonzero()[:, 0]
-        assert samples.point[own].tolist() == list(range(7))
-        for at in own.tolist():
-            column, row = place[samples.point[at]].tolist()
-            side = round(5 * float((depth[samples.point[at]] + 3) / depth[samples.point[at]]))
+        near = samples.view == 0
+        assert samples.point[near].tolist() == samples.point[~near].tolist() == list(range(7))
+        assert samples.pixel[near].tolist() == (place[:, 0] + 60 * place[:, 1]).tolist()
+        for at, number in enumerate(samples.view.tolist()):
+            row, column = divmod(int(samples.pixel[at]), 60)
+            own = float(depth[samples.point[at]])
+            side = 5 if number else round(5 * (own + 3) / own)
             left, top = (round(each + 0.5 - side / 2) for each in (column, row))
             part = slice(max(top, 0), top + side), slice(max(left, 0), left + side)
-            counts = (torch.ones(40, 60, dtype=torch.bool) if seen is None else seen)[part]
-            expected = image[part][counts].float().mean(dim=0) / 255 / gain
+            counts = (torch.ones(40, 60, dtype=torch.bool) if number or seen is None else seen)[part]
+            expected = images[number][part][counts].float().mean(dim=0) / 255
             assert side % 2 == 0 or (side - 1) / 2 == column - left  # odd ones are around the pixel
-            torch.testing.assert_close(samples.patch[at], expected)
+            torch.testing.assert_close(samples.patch[at], expected if number else expected / gain)
 
 
 def test_what_a_mask_hides_is_never_read() -> None:
