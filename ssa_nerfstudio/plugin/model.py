@@ -145,8 +145,6 @@ class SSASplatfactoModel(PhotoLosses):
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         fit_checkpoint(self.exposure, dict, "exposure.")
         dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored
-        if self.config.strategy == "mcmc":
-            dict["near_plane"] = torch.tensor(NEAR_PLANE)  # of an ADC that MCMC goes on from
         dict["by_mcmc"] = self.by_mcmc
         loaded = super(SplatfactoModel, self).load_state_dict(dict, **kwargs)
         self._near_plane = float(self.near_plane)
