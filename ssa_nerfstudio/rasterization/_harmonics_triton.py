@@ -34,7 +34,7 @@ def gradients_of(
     n = len(means)
     _differentiate[(triton.cdiv(n, _BLOCK),)](
         means, center, rest, radii, colors, slopes, of_means, of_constant, of_rest, n, 3 * rest.shape[1],
-        triton.next_power_of_2(3 * rest.shape[1]), degree, _BLOCK,
+        max(1, triton.next_power_of_2(3 * rest.shape[1])), degree, _BLOCK,
     )  # fmt: skip
     return of_means, of_constant, of_rest
 

@@ -1,7 +1,8 @@
 """gsplat's CUDA kernels behind `interface.make_rasterization`.
 
-The same sequence of gsplat's public operators as `gsplat.rasterization`, with one difference: that function inverts the
-view matrix with `torch.inverse`, which waits for the device at every frame. A rigid matrix needs no solver.
+The same sequence of gsplat's public operators as `gsplat.rasterization`, with two differences. That function inverts
+the view matrix with `torch.inverse`, which waits for the device at every frame; a rigid matrix needs no solver. And
+`tile_lists` lists the Gaussians of each tile.
 """
 
 from __future__ import annotations

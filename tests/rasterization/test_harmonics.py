@@ -37,7 +37,7 @@ def gradients(colors: Tensor, given: dict[str, Tensor]) -> list[Tensor]:
 
 
 @pytest.mark.parametrize("triton", [False, pytest.param(True, marks=CUDA.marks)])
-@pytest.mark.parametrize(("degree", "others"), [(0, 15), (1, 15), (2, 8), (3, 15), (4, 24)])
+@pytest.mark.parametrize(("degree", "others"), [(0, 0), (0, 15), (1, 15), (2, 8), (3, 15), (4, 24)])
 @pytest.mark.parametrize("count", [1, 1000])
 def test_colors_and_their_gradients_are_gsplats(monkeypatch, triton, degree, others, count):
     device = "cuda" if torch.cuda.is_available() else "cpu"
