@@ -62,7 +62,7 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
         ),
         (["tile_list_time.py", "--help"], 0, "usage: python benchmarks/tile_list_time.py"),
         (["tile_list_time.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
-        (["tile_list_time.py", "--data", "x", "--steps", "1699"], 2, "--steps must be at least 1700"),
+        (["tile_list_time.py", "--data", "x", "--steps", "1799"], 2, "--steps must be at least 1800"),
         (["start_accuracy.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
         (["export_speed.py", "--output", "nowhere", "--gaussians", "0"], 2, "--gaussians must be at least 1, got 0"),
         (["train.py", "--data", "nowhere", "--output", "nowhere"], 2, "nowhere/transforms.json does not exist"),
