@@ -98,6 +98,7 @@ def initialize_from(
     layers = torch.where(present, layers, layers.new_tensor([1.0, 0.0, 0.0, 0.0]))
     likely = None if static is None else _likely_colors(layers, static, guide[..., :3].to(layers) / falloff, reduction)
     initialize_as(overlay, layers, likely)
+    overlay.noise.copy_(estimate.noise)
     if (falloff < 1).any():
         overlay.falloff = _at_overlay_resolution(falloff, overlay).to(overlay.falloff)
 

@@ -7,7 +7,7 @@ other by linear regression: the training's own problem, solved on the points alo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
@@ -60,6 +60,8 @@ class LayerEstimate:
     """F [h, w, 1] in (0, 1]: of the lens, see `falloff.estimate_falloff`."""
     unexplained: Tensor
     """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers."""
+    noise: Tensor = field(default_factory=lambda: torch.ones(()))
+    """Robust deviation of the samples from these layers, [] in (0, 1]; 1: unknown."""
 
     def opacity(self) -> Tensor:
         """The least matte [h, w, 1] that explains T and B."""
@@ -148,7 +150,9 @@ def estimate_layers(
     counts = torch.cat([outliers.to(residual), torch.ones_like(residual[:, :1])], dim=-1)
     around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), OCCLUSION_RADIUS)
     unexplained = around[..., :1] / around[..., 1:].clamp_min(1e-9)
-    return LayerEstimate(layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained)
+    return LayerEstimate(
+        layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained, scale.clamp_max(1.0)
+    )
 
 
 def robust_deviation(residuals: Tensor) -> Tensor:

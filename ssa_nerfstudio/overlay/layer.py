@@ -26,8 +26,8 @@ scene behind an opaque pixel loses all gradient. 0.999 is 255 in 8 bits, and gsp
 oracle overlay has no such range."""
 COLOR_LOGIT_RANGE = (-12.0, 12.0)
 """Range of the learned color's logits: 6e-6 to 1 - 6e-6, for the same reason."""
-OPTIONAL_MAPS = ("falloff", "reliable")
-"""Buffers of an overlay that have one pixel where they change nothing."""
+OPTIONAL_BUFFERS = ("falloff", "reliable", "noise")
+"""Buffers of an overlay that have one pixel of value 1 where nothing is known of them, as in earlier checkpoints."""
 
 
 class ScreenSpaceOverlay(nn.Module):
@@ -47,6 +47,8 @@ class ScreenSpaceOverlay(nn.Module):
     reliable: Tensor
     """[h, w, 1] in [0, 1]: 0 where the artifact changes (`evidence.changing_area`), and the scene gets no gradient;
     [1, 1, 1] of value 1 for nowhere."""
+    noise: Tensor
+    """[1, 1, 1] in (0, 1]: deviation of the photos from scene and artifact (`LayerEstimate.noise`); 1 where unknown."""
 
     def __init__(self, height: int, width: int, resolution: int = 1, adds_light: bool = False) -> None:
         """Create an overlay with constant color and matte.
@@ -65,6 +67,7 @@ class ScreenSpaceOverlay(nn.Module):
         self.register_buffer("evidence", torch.ones(*size, 1))
         self.register_buffer("falloff", torch.ones(1, 1, 1))
         self.register_buffer("reliable", torch.ones(1, 1, 1))
+        self.register_buffer("noise", torch.ones(1, 1, 1))
         self.height, self.width, self.resolution, self.adds_light = height, width, resolution, adds_light
 
     @torch.no_grad()

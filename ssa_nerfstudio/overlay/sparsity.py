@@ -13,6 +13,8 @@ Sparsity = Literal["l1", "log", "off"]
 
 LOG_SOFTNESS = 0.1
 """e of the concave penalty log(1 + A / e): like l1 below this opacity, lenient on opaque pixels above it."""
+MAX_WEIGHT = 0.02
+"""Largest weight of the term, where none is stated; see `sparsity_weight`."""
 LOG_EVIDENCE_FLOOR = 0.1
 """Share of the concave penalty that a pixel pays even where the artifact is known."""
 
@@ -41,6 +43,22 @@ def sparsity_loss(matte: Tensor, evidence: Tensor, kind: Sparsity) -> Tensor:
     if kind == "log":
         return _LogSparsity.apply(matte, evidence)  # pyright: ignore[reportReturnType]
     raise ValueError(f"unknown sparsity term {kind!r}; choose l1, log or off")
+
+
+def sparsity_weight(noise: Tensor) -> Tensor:
+    """Weight of the sparsity loss: the photos' noise, at most MAX_WEIGHT.
+
+    The photometric loss is a mean of absolute differences. As a likelihood (Laplace's), it is divided by their scale,
+    so that a prior that is to mean the same behind any photos weighs as much as they deviate. A weight beyond the noise
+    pulls thin parts of an artifact towards clear, against what the photos say.
+
+    Args:
+        noise: deviation of the photos from what is predicted of them, [] in (0, 1].
+
+    Returns:
+        [].
+    """
+    return noise.clamp_max(MAX_WEIGHT)
 
 
 class _LogSparsity(torch.autograd.Function):

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from ssa_nerfstudio.cameras.intervals import BEGINNING, capture_order, interval_at
 from ssa_nerfstudio.data.photos import MAX_PIXELS
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.overlay.layer import OPTIONAL_MAPS, OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
+from ssa_nerfstudio.overlay.layer import OPTIONAL_BUFFERS, OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES, find_frame, match_camera, nearest_aspect
 from ssa_nerfstudio.plugin.view_geometry import metadata
@@ -185,7 +185,7 @@ class Artifacts(nn.Module):
             if len(state[f"{overlay}frame"]) == 3:  # checkpoints from before additive light
                 state[f"{overlay}frame"] = F.pad(state[f"{overlay}frame"], (0, 1))
             state.pop(f"{overlay}near", None)  # checkpoints from before the estimate from points
-            for name in OPTIONAL_MAPS if f"{overlay}alpha_logits" in state else ():  # earlier checkpoints have none
+            for name in OPTIONAL_BUFFERS if f"{overlay}alpha_logits" in state else ():  # earlier checkpoints have none
                 state.setdefault(overlay + name, torch.ones(1, 1, 1))
         frames = [tuple(int(v) for v in state[f"{prefix}overlays.{g}.frame"]) for g in range(count)]
         for height, width, *_ in frames:
@@ -219,7 +219,7 @@ class Artifacts(nn.Module):
 
     def _allocate_optional(self, state: dict[str, Any], prefix: str) -> None:
         for g, overlay in enumerate(self.learned()):  # all of them, or none
-            for name in OPTIONAL_MAPS:
+            for name in OPTIONAL_BUFFERS:
                 without = state[f"{prefix}overlays.{g}.{name}"].numel() == 1
                 setattr(overlay, name, torch.ones_like(overlay.evidence[:1, :1] if without else overlay.evidence))
 

@@ -10,9 +10,10 @@ from torch import Tensor
 
 from ssa_nerfstudio._system.cuda_graphs import CapturedPrograms, RecordedCalls, graphs_are_usable
 from ssa_nerfstudio._system.parameter_replacement import parameters_replaced
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.resampling import box_reduce
-from ssa_nerfstudio.overlay.sparsity import sparsity_loss
+from ssa_nerfstudio.overlay.sparsity import sparsity_loss, sparsity_weight
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
 from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
@@ -61,8 +62,11 @@ class PhotoLosses(SplatfactoModel):
         losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
         if self._sparsity_counts():
             learned, kind = self.artifacts.learned(), self.config.sparsity
-            terms = [sparsity_loss(overlay.opacity(), overlay.evidence, kind) for overlay in learned]
-            losses["sparsity"] = self.config.sparsity_weight * (torch.stack(terms).mean() if terms[1:] else terms[0])
+            terms = [
+                self._sparsity_weight(overlay) * sparsity_loss(overlay.opacity(), overlay.evidence, kind)
+                for overlay in learned
+            ]
+            losses["sparsity"] = torch.stack(terms).mean() if terms[1:] else terms[0]
         return losses
 
     def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
@@ -94,6 +98,10 @@ class PhotoLosses(SplatfactoModel):
         found = dict(zip(names, evaluated.values))  # noqa: B905 - there may be no composite
         drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
         return found
+
+    def _sparsity_weight(self, overlay: ScreenSpaceOverlay) -> float | Tensor:
+        stated = self.config.sparsity_weight
+        return sparsity_weight(overlay.noise.squeeze()) if stated is None else stated
 
     def _sparsity_counts(self) -> bool:
         return self.training and self.config.sparsity != "off" and bool(self.artifacts.learned())

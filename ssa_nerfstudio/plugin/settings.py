@@ -45,8 +45,9 @@ class ModelSettings(SplatfactoModelConfig):
     points say, and photo where they say nothing."""
     sparsity: Sparsity = "log"
     """Sparsity term of the matte: log (concave, weighted by the initial transmittance), l1 (the paper's), off."""
-    sparsity_weight: float = 0.02
-    """Weight of the sparsity term, lambda_sparse, not negative; the paper has 0.05, and 0.01 for mud."""
+    sparsity_weight: float | None = None
+    """Weight of the sparsity term, lambda_sparse, not negative; None: the photos' noise, at most 0.02; the paper has
+    0.05, and 0.01 for mud."""
     ignore_background: bool = True
     """Take the matte's gradient as if the overlay's color were the background, so that hiding background that no
     splat covers (a sky without points) is not rewarded; False: plain compositing, as in the paper."""

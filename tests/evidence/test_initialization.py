@@ -116,7 +116,7 @@ def estimated(height: int, width: int, transmittance: float, addition: tuple[flo
     """Layers on the left half, nothing on the right half but a little noise."""
     T, B = torch.full((height, width, 1), 0.97), torch.full((height, width, 3), 0.02)
     T[:, : width // 2], B[:, : width // 2] = transmittance, torch.tensor(addition)
-    return LayerEstimate(T, B, torch.ones_like(T), torch.zeros_like(T))
+    return LayerEstimate(T, B, torch.ones_like(T), torch.zeros_like(T), torch.tensor(0.03))
 
 
 @pytest.mark.parametrize("resolution", [1, 2])
@@ -135,6 +135,7 @@ def test_an_overlay_starts_from_estimated_layers_and_clear_where_they_are_noise(
     assert (T[:, half + rim :] > 0.989).all()
     torch.testing.assert_close(overlay.evidence[:, :half], T[:, :half], atol=1e-5, rtol=0)
     assert (overlay.evidence[:, half + rim :] == 1).all()
+    assert float(overlay.noise) == pytest.approx(0.03)  # what sparsity may weigh
     # Where nothing was found, the color is the artifact's: a matte there grows only where the artifact is.
     likely = torch.tensor(addition) / (1 - transmittance)
     assert (overlay.color()[:, half + rim :] - likely.clamp(0.002, 1)).abs().max() < 0.1

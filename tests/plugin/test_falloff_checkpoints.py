@@ -24,7 +24,7 @@ def test_the_checkpoint_says_whether_there_is_a_falloff(saved: float | None, her
     before = artifacts(saved)
     state = before.state_dict()
     if saved is None:
-        del state["overlays.0.falloff"], state["overlays.0.reliable"]
+        del state["overlays.0.falloff"], state["overlays.0.reliable"], state["overlays.0.noise"]
     resumed = {"nothing": Artifacts, "the same": lambda: artifacts(saved)}.get(
         here, lambda: artifacts(None if here == "no falloff" else 0.7)
     )()

@@ -10,7 +10,7 @@ from nerfstudio.models.splatfacto import resize_image
 
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.photometric import photometric_loss
-from ssa_nerfstudio.overlay.sparsity import sparsity_loss
+from ssa_nerfstudio.overlay.sparsity import MAX_WEIGHT, sparsity_loss
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.training.schedules import scaled
 
@@ -24,6 +24,7 @@ def trainer(tiny_scene, tmp_path_factory, configure_training):
     trainer = config.setup(local_rank=0, world_size=1)
     trainer.setup()
     trainer.pipeline.model.step_cb(trainer.optimizers, 0)  # as before the first step
+    trainer.pipeline.model.recordable = False  # on CUDA, too, a step draws its pictures
     return trainer
 
 
@@ -86,7 +87,7 @@ def test_the_loss_of_a_test_photo_is_of_the_clean_render(model):
 
 def test_several_overlays_weigh_as_much_as_one(model):
     one = losses(model)["sparsity"]
-    weight = model.config.sparsity_weight
+    weight = MAX_WEIGHT  # of photos whose noise nobody knows
     own = model.artifacts.learned()[0]
     assert_close(one, weight * sparsity_loss(own.opacity(), own.evidence, "log"))
     other = ScreenSpaceOverlay(48, 64).to(model.device)
@@ -95,6 +96,19 @@ def test_several_overlays_weigh_as_much_as_one(model):
     model.artifacts.overlays = torch.nn.ModuleList([own, other])
     second = weight * sparsity_loss(other.opacity(), other.evidence, "log")
     assert_close(losses(model)["sparsity"], (one + second) / 2)
+
+
+@pytest.mark.parametrize(
+    ("stated", "noise", "weight"),
+    [(None, 0.004, 0.004), (None, 0.05, MAX_WEIGHT), (0.05, 0.004, 0.05), (0.0, 0.01, 0.0)],
+)
+def test_sparsity_weighs_no_more_than_the_noise_unless_its_weight_is_stated(model, stated, noise, weight):
+    own = model.artifacts.learned()[0]
+    model.config.sparsity_weight = stated
+    own.noise.fill_(noise)
+    found = losses(model)["sparsity"]
+    own.noise.fill_(1.0)
+    assert_close(found, weight * sparsity_loss(own.opacity(), own.evidence, "log"))
 
 
 def test_mcmc_pays_for_opacity_and_for_size(model):
