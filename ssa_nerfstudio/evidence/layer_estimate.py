@@ -45,7 +45,7 @@ MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges."""
 
 _LEAST_WEIGHT = 1e-3
-"""Of a sample: a point that has no better ones still has their median."""
+"""Of a sample that is left out of a median: a point that has no others keeps a color."""
 
 
 @dataclass(frozen=True)
@@ -165,8 +165,9 @@ def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tens
 
     A color is the median of the point's samples, each weighed by how much the photos vary at its pixel: what is in
     front varies little. But a thumb in changing light may vary more than a plain floor. So colors and the pixels that
-    hide them are found by turns, and the samples of these leave the median to the others. That takes more than it
-    takes to start as opaque: a third of the scene, because the colors, too, are uncertain where all photos agree.
+    hide them are found by turns, and the samples of these leave the median to the others. A pixel
+    has to hide two thirds of the scene for that, and half of it to start as opaque, because the colors, too, are
+    uncertain where all photos agree.
 
     Behind what is opaque every sample is an outlier to a clear pixel. Robust weights would then silence all of them,
     and the prior would take the pixel for clear. So the residuals of a pixel that hides are those of an opaque one.
@@ -183,7 +184,7 @@ def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tens
 
 
 def _hiding(samples: PointSamples, clear: Tensor, constant: Tensor, shown: float) -> Tensor:
-    """Whether at most the share `shown` of the scene comes through where a sample is, bool [S].
+    """Whether less than the share `shown` of the scene comes through where a sample is, bool [S].
 
     What comes through of a scene varies by T |C - mean C|, so differences from the photos' mean, `constant` [S, 3], are
     T / (1 - T) times those from the points, `clear`, summed over their absolute values around the pixel.

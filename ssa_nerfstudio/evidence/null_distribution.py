@@ -18,7 +18,7 @@ from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence, e
 MAX_SHIFT = 16
 """Blocks are shifted by up to this many working pixels in each direction, in steps of COARSE_FACTOR."""
 VALUES_AT_ONCE = 2**22
-"""Of sums of moments, in memory: a GPU waits for its host, which does so much at once."""
+"""Sums of moments, of shifted captures or intervals, that are computed together: a GPU waits for each launch."""
 
 
 def null_shares(evidence: EdgeEvidence, draws: int, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
