@@ -69,8 +69,9 @@ class Command:
     def _train(self, overlay: str, guards: bool) -> dict[str, Any]:
         from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 
-        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import prepared_trainer
         from ssa_nerfstudio.experiments.runs.run_configuration import configure
+        from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
 
         model = {"overlay": overlay, "guards": guards, "cap_max": self.cap_max}
         config = configure("ssa-splatfacto-mcmc", self.data, self.output / "runs", self.steps, model, self.scale_factor)

@@ -55,7 +55,7 @@ class Command:
         if self.block < 1 or CHECK_EVERY % self.block or self.pairs < 4:
             raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 4")
         Transforms.read(self.data)
-        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left
+        from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
 
         with TemporaryDirectory() as folder, no_event_writers_left():
             training = self._training(Path(folder))

@@ -75,12 +75,14 @@ class Command:
         Transforms.read(self.data)
         if self.method == "splatfacto" and not torch.cuda.is_available():
             raise InputError("there is no CUDA, without which splatfacto cannot train", "choose another --method")
-        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import prepared_trainer
+        from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
+        from ssa_nerfstudio.plugin.training.step_callbacks import after_each_step
 
         with TemporaryDirectory() as folder, no_event_writers_left():
             trainer = prepared_trainer(self._config(Path(folder)))
             if self.gaussians:
-                _after_each_step(trainer, _growth(trainer, self.gaussians))
+                after_each_step(trainer, _growth(trainer, self.gaussians))
             if self.profile is not None:
                 trainer.config.max_num_iterations = PROFILED[1] + 1
                 _write_profile(trainer, self.profile)
@@ -111,6 +113,8 @@ class Command:
 
     def _time(self, trainer: Any) -> None:
         """Train, and print a line for each value of SSA_CUDA_GRAPHS."""
+        from ssa_nerfstudio.plugin.training.step_callbacks import after_each_step
+
         last = FIRST + 4 * len(GRAPHS) * TURN if self.alternate else LAST
         trainer.config.max_num_iterations = last + 1
         times: dict[int, float] = {}
@@ -125,7 +129,7 @@ class Command:
                 if self.alternate:
                     os.environ["SSA_CUDA_GRAPHS"] = [*GRAPHS.values()][(step - FIRST) // TURN % len(GRAPHS)]
 
-        _after_each_step(trainer, note)
+        after_each_step(trainer, note)
         trainer.train()
         for number, graphs in enumerate(GRAPHS if self.alternate else [""]):
             turns = range(FIRST + number * TURN, last, len(GRAPHS) * TURN) if self.alternate else [FIRST]
@@ -156,13 +160,6 @@ def _enlarged(data: Path, factor: float, folder: Path) -> Path:
     return folder
 
 
-def _after_each_step(trainer: Any, call: Callable[[int], None]) -> None:
-    """Let a training call this after every step, with the step's number from 0."""
-    from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-
-    trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], call))
-
-
 def _growth(trainer: Any, count: int) -> Callable[[int], None]:
     """What splits the Gaussians, those with the largest opacity last, and ends their densification."""
 
@@ -181,6 +178,8 @@ def _growth(trainer: Any, count: int) -> Callable[[int], None]:
 
 def _write_profile(trainer: Any, path: Path) -> None:
     """Train, and write what `PROFILED` holds: launches and milliseconds a step, operations by the time of each side."""
+    from ssa_nerfstudio.plugin.training.step_callbacks import after_each_step
+
     profiler = torch.profiler.profile(activities=torch.profiler.supported_activities())
 
     def note(step: int) -> None:
@@ -191,7 +190,7 @@ def _write_profile(trainer: Any, path: Path) -> None:
                 torch.cuda.synchronize()
             profiler.stop()
 
-    _after_each_step(trainer, note)
+    after_each_step(trainer, note)
     trainer.train()
     found, steps = profiler.key_averages(), PROFILED[1] - PROFILED[0]
     names = ("launch", "memcpyasync", "memsetasync", "synchronize")

@@ -51,8 +51,9 @@ class Command:
             raise InputError("there is no CUDA", "a CPU's rasterizer has lists of its own")
         if not tile_lists._TRITON:
             raise InputError("our lists need Triton, which is not installed", "pip install triton")
-        from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+        from ssa_nerfstudio.experiments.runs.prepared_trainer import prepared_trainer
         from ssa_nerfstudio.experiments.runs.run_configuration import configure
+        from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
         from ssa_nerfstudio.plugin.training.schedules import DEFAULT_LENGTH
 
         settings = {"strategy": self.strategy, "overlay": "on"}
@@ -63,7 +64,7 @@ class Command:
             self._time(trainer)
 
     def _time(self, trainer: Any) -> None:
-        from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
+        from ssa_nerfstudio.plugin.training.step_callbacks import after_each_step
 
         model = trainer.pipeline.model
         turns: dict[bool, list[tuple[Lap, int]]] = {False: [], True: []}
@@ -95,7 +96,7 @@ class Command:
                 refinements.append(lap)
 
         cuda.tile_lists, model.strategy.step_post_backward = counted, refine
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], note))
+        after_each_step(trainer, note)
         trainer.train()
         for ours, found in turns.items():
             each = (f"{1e3 * lap.seconds() / TURN:.2f} ({gaussians:,})" for lap, gaussians in found)

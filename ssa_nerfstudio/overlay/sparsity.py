@@ -11,10 +11,10 @@ from torch.autograd.function import once_differentiable
 
 Sparsity = Literal["l1", "log", "off"]
 
-LOG_SOFTNESS = 0.1
-"""e of the concave penalty log(1 + A / e): like l1 below this opacity, lenient on opaque pixels above it."""
 MAX_WEIGHT = 0.02
 """Largest weight of the term, where none is stated; see `sparsity_weight`."""
+LOG_SOFTNESS = 0.1
+"""e of the concave penalty log(1 + A / e): like l1 below this opacity, lenient on opaque pixels above it."""
 LOG_EVIDENCE_FLOOR = 0.1
 """Share of the concave penalty that a pixel pays even where the artifact is known."""
 

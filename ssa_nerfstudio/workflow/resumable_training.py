@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import random
 from collections.abc import Callable
 from pathlib import Path
 from typing import cast
-
-import numpy as np
-import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
-from nerfstudio.utils import writer
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state, newest_first, step_of
+from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
+from ssa_nerfstudio.plugin.training.random_numbers import seed_all
+from ssa_nerfstudio.plugin.training.step_callbacks import after_each_step
 from ssa_nerfstudio.sfm.progress_display import ProgressCallback
 
 
@@ -25,6 +22,7 @@ def config_file(config: SSATrainerConfig) -> Path:
     return config.get_base_dir() / "config.yml"
 
 
+@no_event_writers_left()
 def train(
     config: SSATrainerConfig, on_progress: ProgressCallback, on_start: Callable[[Artifacts], None] = lambda _: None
 ) -> int:
@@ -41,30 +39,21 @@ def train(
     Raises:
         SSAError: the input cannot be used, or the training cannot continue.
     """
-    seed = config.machine.seed
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
-    torch.manual_seed(seed)
+    seed_all(config.machine.seed)
     config.load_dir = None
     config.save_config()
     checkpoints = Path(config.get_checkpoint_dir())
     config.load_dir = checkpoints if newest_first(checkpoints) else None
-    try:
-        trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
+    trainer: SSATrainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
 
-        def after_step(step: int) -> None:
-            on_progress("step", step + 1, config.max_num_iterations)
+    def after_step(step: int) -> None:
+        on_progress("step", step + 1, config.max_num_iterations)
 
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], after_step))
-        on_start(trainer.pipeline.model.artifacts)
-        began = trainer._start_step
-        trainer.train()
-    finally:
-        # nerfstudio keeps its event writers in globals: the next run in this process starts with none.
-        writer.EVENT_WRITERS.clear()
-        writer.EVENT_STORAGE.clear()
-        writer.GLOBAL_BUFFER.clear()
+    after_each_step(trainer, after_step)
+    on_start(trainer.pipeline.model.artifacts)
+    began = trainer._start_step
+    trainer.train()
     return began
 
 

@@ -10,8 +10,9 @@ import torch
 
 from benchmarks import tile_list_time
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.prepared_trainer import no_event_writers_left, prepared_trainer
+from ssa_nerfstudio.experiments.runs.prepared_trainer import prepared_trainer
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
+from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
 from ssa_nerfstudio.rasterization import cuda, tile_lists
 
 

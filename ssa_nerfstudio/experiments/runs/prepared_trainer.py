@@ -1,16 +1,13 @@
-"""nerfstudio's trainers, ready to train: the one place here that seeds and sets them up, and cleans up after them."""
+"""nerfstudio's trainers, ready to train: seeded, written down and set up."""
 
 from __future__ import annotations
 
-import random
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
-import numpy as np
-import torch
 from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils import writer
+
+from ssa_nerfstudio.plugin.training.random_numbers import seed_all
 
 
 def prepared_trainer(config: TrainerConfig) -> Any:
@@ -35,10 +32,7 @@ def begin_run(config: TrainerConfig) -> None:
     Raises:
         InputError: a setting cannot be used.
     """
-    seed = config.machine.seed
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002 - nerfstudio draws from numpy's global generator
-    torch.manual_seed(seed)
+    seed_all(config.machine.seed)
     config.set_timestamp()
     config.save_config()
 
@@ -57,14 +51,3 @@ def set_up_trainer(config: TrainerConfig) -> Any:
     writer.EVENT_WRITERS.clear()  # not read by anything here
     trainer.config.viewer.quit_on_train_completion = True
     return trainer
-
-
-@contextmanager
-def no_event_writers_left() -> Iterator[None]:
-    """Clear, at the end, what nerfstudio keeps of a run in globals: the next run in this process starts with none."""
-    try:
-        yield
-    finally:
-        writer.EVENT_WRITERS.clear()
-        writer.EVENT_STORAGE.clear()
-        writer.GLOBAL_BUFFER.clear()

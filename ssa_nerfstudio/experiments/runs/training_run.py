@@ -10,19 +10,20 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.utils.rich_utils import CONSOLE
 
 from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
 from ssa_nerfstudio.experiments.runs.machine import versions
-from ssa_nerfstudio.experiments.runs.prepared_trainer import begin_run, no_event_writers_left, set_up_trainer
+from ssa_nerfstudio.experiments.runs.prepared_trainer import begin_run, set_up_trainer
 from ssa_nerfstudio.experiments.runs.run_timing import StepClock, TimedDatamanager, TimedPipeline, mean_metrics
 from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
 from ssa_nerfstudio.plugin.evaluation import view_metrics_without_flip
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 from ssa_nerfstudio.plugin.trainer import SSATrainer, SSATrainerConfig
+from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
+from ssa_nerfstudio.plugin.training.step_callbacks import after_each_step
 
 INVISIBLE = 1 / 255
 """Opacity below which a rasterizer skips a Gaussian."""
@@ -92,7 +93,7 @@ def train_and_evaluate(
         pipeline.read_photos(test_scale)
         judge = partial(evaluate, pipeline, flips, region)
         clock = StepClock(pipeline, config.max_num_iterations, marks, on_step, judge)
-        trainer.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], clock.after_step))
+        after_each_step(trainer, clock.after_step)
         if clock.cuda:
             torch.cuda.reset_peak_memory_stats()
         setup = time.perf_counter() - start

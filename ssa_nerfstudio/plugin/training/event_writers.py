@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import reduce
 from typing import Any
 
@@ -44,6 +46,17 @@ def thin_event_writers(every: int) -> None:
         each if isinstance(each, writer.LocalWriter) else ThinnedWriter(each, max(1, every))
         for each in writer.EVENT_WRITERS
     ]
+
+
+@contextmanager
+def no_event_writers_left() -> Iterator[None]:
+    """Clear, at the end, what nerfstudio keeps of a run in globals: the next run in this process starts with none."""
+    try:
+        yield
+    finally:
+        writer.EVENT_WRITERS.clear()
+        writer.EVENT_STORAGE.clear()
+        writer.GLOBAL_BUFFER.clear()
 
 
 def gradient_norms(model: torch.nn.Module) -> dict[str, torch.Tensor]:

@@ -12,8 +12,9 @@ from nerfstudio.engine.trainer import TrainerConfig
 from nerfstudio.utils import writer
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.prepared_trainer import begin_run, no_event_writers_left, prepared_trainer
+from ssa_nerfstudio.experiments.runs.prepared_trainer import begin_run, prepared_trainer
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
+from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
 
 
 def test_a_trainer_is_ready_to_train_and_to_end(tiny_scene, tmp_path):
@@ -44,10 +45,3 @@ def test_a_setting_that_cannot_be_used_leaves_no_config(tiny_scene, tmp_path):
     with pytest.raises(InputError):
         begin_run(configure("ssa-splatfacto", tiny_scene, tmp_path, 0))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_event_writers_are_cleared_after_an_error_too():
-    writer.EVENT_STORAGE.append({})
-    with pytest.raises(KeyError), no_event_writers_left():
-        raise KeyError
-    assert writer.EVENT_STORAGE == []

@@ -9,7 +9,7 @@ from nerfstudio.configs.base_config import LocalWriterConfig
 from nerfstudio.utils import writer
 
 from ssa_nerfstudio.plugin.training.console_table import ConsoleTable
-from ssa_nerfstudio.plugin.training.event_writers import ThinnedWriter, thin_event_writers
+from ssa_nerfstudio.plugin.training.event_writers import ThinnedWriter, no_event_writers_left, thin_event_writers
 
 ALWAYS = ("Train Loss", "Eval PSNR", "my learning_rate/means")
 NOW_AND_THEN = (
@@ -138,3 +138,10 @@ def test_the_banner_stays_below_the_rows_of_a_terminal(table, capsys):
     assert "20 (" in row
     assert set(rule.strip(" \x1b[0m")) == {"-"}
     assert "viewer: http://localhost:7007" in last
+
+
+def test_event_writers_are_cleared_after_an_error_too():
+    writer.EVENT_STORAGE.append({})
+    with pytest.raises(KeyError), no_event_writers_left():
+        raise KeyError
+    assert writer.EVENT_STORAGE == []
