@@ -27,26 +27,33 @@ def composite(clean: Tensor, transmittance: Tensor, addition: Tensor) -> Tensor:
 
 
 def composite_over_splats(
-    clean: Tensor, accumulation: Tensor, background: Tensor, transmittance: Tensor, addition: Tensor
+    clean: Tensor,
+    accumulation: Tensor,
+    background: Tensor,
+    transmittance: Tensor,
+    addition: Tensor,
+    adds_light: bool = False,
 ) -> Tensor:
     """`composite` with a gradient that does not reward the matte for hiding background.
 
     Where no splat covers a pixel, the render shows the background color (in splatfacto a random one at every step).
     Plain compositing rewards an overlay for hiding it, and a sky without a single seed point ends up in the overlay.
     Here the matte's gradient is taken as if the overlay's own color were the background: hiding background gains
-    nothing, sparsity removes the overlay there, and the scene has to fill the hole.
+    nothing, sparsity removes the overlay there, and the scene has to fill the hole. A matte beside additive light
+    shows no color of its own, so the background is black there.
 
     Args:
         clean: C [H, W, 3], the render with its background.
         accumulation: opacity of the splats [H, W, 1] in [0, 1].
         background: the color behind them [3].
         transmittance, addition: T [H, W, 1] and B [H, W, 3] in [0, 1].
+        adds_light: B does not depend on the matte.
 
     Returns:
         [H, W, 3], the same values as `composite`.
     """
     with torch.no_grad():
-        color, _ = straight_color(transmittance, addition)
+        color = torch.zeros_like(background) if adds_light else straight_color(transmittance, addition)[0]
         over_color = clean + (1.0 - accumulation) * (color - background)
     return _OverSplats.apply(clean, transmittance, addition, over_color)  # pyright: ignore[reportReturnType]
 

@@ -121,7 +121,10 @@ class ScreenSpaceOverlay(nn.Module):
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         else:
             layers = self._before_falloff(reduction)
-            image = composite(clean, *layers) if behind is None else composite_over_splats(clean, *behind, *layers)
+            if behind is None:
+                image = composite(clean, *layers)
+            else:
+                image = composite_over_splats(clean, *behind, *layers, self.adds_light)
         return image if self.falloff.numel() == 1 else image * self._at_training_scale(self.falloff, reduction)
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:

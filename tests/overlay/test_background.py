@@ -51,6 +51,24 @@ def test_the_matte_has_no_gradient_where_splats_explain_the_photo():
     assert matte_gradient(0.6, over_splats=True).abs().max() < 1e-12
 
 
+@pytest.mark.parametrize("accumulation", [0.0, 0.4, 1.0])
+def test_a_matte_beside_additive_light_hides_no_background(accumulation):
+    """Its gradient is that over a black background, whatever the background is; the light's own is the plain one."""
+    overlay = ScreenSpaceOverlay(4, 5, adds_light=True).double()
+    color = torch.tensor([0.3, 0.4, 0.5], dtype=torch.float64)
+    opacity, found = torch.full((4, 5, 1), accumulation, dtype=torch.float64), []
+    for background, over_splats in (([0.9, 0.1, 0.1], True), ([0.0, 0.0, 0.0], False)):
+        behind = opacity, torch.tensor(background, dtype=torch.float64)
+        clean = opacity * color + (1 - opacity) * behind[1]
+        overlay.zero_grad()
+        image = overlay.composite(clean, behind=behind if over_splats else None)
+        image.backward(torch.full_like(image, 0.7))
+        found.append((overlay.alpha_logits.grad, overlay.color_logits.grad))
+    for ours, plain in zip(*found, strict=True):
+        torch.testing.assert_close(ours, plain, rtol=1e-12, atol=1e-15)
+    assert (found[0][0] == 0).all() == (accumulation == 0)
+
+
 def test_where_splats_are_opaque_the_gradient_is_the_plain_one():
     torch.testing.assert_close(matte_gradient(1.0, True), matte_gradient(1.0, False), rtol=1e-12, atol=1e-15)
 
@@ -116,7 +134,7 @@ def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, ove
         elif behind is None:
             shown = composite(clean, *overlay.layers(reduction))
         else:
-            shown = composite_over_splats(clean, *behind, *overlay.layers(reduction))
+            shown = composite_over_splats(clean, *behind, *overlay.layers(reduction), adds_light)
         (shown**2).sum().backward()
         found.append((shown.detach(), overlay.color_logits.grad, overlay.alpha_logits.grad))
     for mine, expected in zip(*found, strict=True):
