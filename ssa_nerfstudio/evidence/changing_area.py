@@ -22,9 +22,10 @@ def changing_area(estimate: LayerEstimate) -> np.ndarray:
     """Where an artifact changes: bool [h, w], of the working size, two pixels wider than what is found."""
     opacity, unexplained = (x[..., 0].cpu().numpy() for x in (estimate.opacity(), estimate.unexplained))
     clear = opacity <= MIN_OPACITY
-    if not clear.any():
+    usual = unexplained[clear & ~np.isnan(unexplained)]
+    if not usual.size:
         return np.zeros_like(clear)
-    unusual = ~clear & (unexplained > np.quantile(unexplained[clear], USUAL))
+    unusual = ~clear & (unexplained > np.quantile(usual, USUAL))
     opened = cv2.morphologyEx(unusual.astype(np.uint8), cv2.MORPH_OPEN, _NEIGHBORS)
     labels = cv2.connectedComponents(opened, connectivity=8)[1].ravel().astype(np.intp)
     hidden = np.bincount(labels, weights=opacity.ravel()) / np.bincount(labels)

@@ -59,7 +59,7 @@ class LayerEstimate:
     falloff: Tensor
     """F [h, w, 1] in (0, 1]: of the lens, see `falloff.estimate_falloff`."""
     unexplained: Tensor
-    """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers."""
+    """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers; NaN without any."""
     noise: Tensor = field(default_factory=lambda: torch.ones(()))
     """Robust deviation of the samples from these layers, [] in (0, 1]; 1: unknown."""
 
@@ -149,7 +149,7 @@ def estimate_layers(
     outliers = residual.square().mean(dim=-1, keepdim=True) > (OUTLIER_SCALE * scale) ** 2
     counts = torch.cat([outliers.to(residual), torch.ones_like(residual[:, :1])], dim=-1)
     around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), OCCLUSION_RADIUS)
-    unexplained = around[..., :1] / around[..., 1:].clamp_min(1e-9)
+    unexplained = around[..., :1] / around[..., 1:]  # 0 / 0 is NaN
     return LayerEstimate(
         layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained, scale.clamp_max(1.0)
     )

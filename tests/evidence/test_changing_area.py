@@ -59,6 +59,16 @@ def test_what_is_explained_or_hides_little_does_not(opacity: float, unexplained:
     assert not changing_area(estimated(opacity, unexplained)).any()
 
 
+def test_pixels_without_samples_say_nothing_of_what_is_usual() -> None:
+    """A blob whose share of outliers others have, too, in a frame of which few pixels have samples."""
+    few = estimated(0.8, 0.09)
+    few.unexplained[torch.rand(HEIGHT, WIDTH, generator=torch.Generator().manual_seed(1)) < 0.9] = torch.nan
+    few.unexplained[BLOB] = 0.09
+    assert not changing_area(few).any()
+    few.unexplained[few.opacity() < 0.5] = torch.nan
+    assert not changing_area(few).any()
+
+
 def test_what_is_unexplained_everywhere_is_no_artifacts_doing() -> None:
     assert not changing_area(estimated(0.8, 0.4, usual=0.6)).any()
     ones = torch.ones(HEIGHT, WIDTH, 1)

@@ -235,6 +235,8 @@ def test_without_samples_the_layers_are_as_expected() -> None:
     found = estimate_layers(part, mean, torch.full((HEIGHT, WIDTH, 1), 0.3), hidden, NOWHERE)
     assert found.transmittance[:, :16].max() < 0.2
     assert found.transmittance[:, 30:].min() > 0.8
+    assert found.unexplained[:, :16].isnan().all()
+    assert not found.unexplained[:, 30:].isnan().any()
 
 
 def strip(samples: PointSamples, every: int) -> PointSamples:
