@@ -23,7 +23,7 @@ def expected_layers(
         samples: of the scene's points.
         colors: of the points, [S, 3], sample by sample.
         mean: of the photos, [h, w, 3] in [0, 1] at the working resolution.
-        deviation: of the photos, [h, w, 1], likewise.
+        deviation: of the photos, [h, w, 1], likewise; NaN where it is unknown.
         hidden: share of a working pixel that is known to be opaque, [h, w, 1] in [0, 1].
         static: share of a working pixel where static edges are, likewise.
     """

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
+from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, UNKNOWN_DEVIATION
 
 RADIUS = 2
 """Working pixels: the layers are a linear function of the guide within windows of this radius."""
@@ -17,6 +17,17 @@ RADIUS = 2
 def reduced(image: Tensor, reduction: int) -> Tensor:
     """Box-filter an image [H, W, C] to [H // reduction, W // reduction, C]; incomplete squares are dropped."""
     return nn.functional.avg_pool2d(image.permute(2, 0, 1)[None], reduction)[0].permute(1, 2, 0)
+
+
+def reduced_deviation(deviation: Tensor, reduction: int) -> Tensor:
+    """Box-filter the photos' deviation [H, W, 1] over the pixels that enough photos show (`ImageStatistics.deviation`).
+
+    Returns:
+        [H // reduction, W // reduction, 1]; NaN where no pixel is known, as behind a mask of all photos.
+    """
+    known = deviation != UNKNOWN_DEVIATION
+    total = reduced(torch.cat([torch.where(known, deviation, 0.0), known.to(deviation)], dim=-1), reduction)
+    return total[..., :1] / total[..., 1:]  # 0 / 0 is NaN
 
 
 def upsample(layers: Tensor, guide: Tensor, reduction: int) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from ssa_nerfstudio.evidence.changing_area import changing_area
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
-from ssa_nerfstudio.evidence.guided_upsampling import enlarged, local_mean, reduced, upsample
+from ssa_nerfstudio.evidence.guided_upsampling import enlarged, local_mean, reduced, reduced_deviation, upsample
 from ssa_nerfstudio.evidence.layer_estimate import CERTAIN_OPACITY, MIN_OPACITY, LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed, working_reduction
 from ssa_nerfstudio.evidence.static_area import connected_parts
@@ -62,7 +62,8 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tenso
     # Photos that vary nowhere show no scene.
     hidden = opaque.to(guide.device) | (guide[..., 3] < GRAY_LEVEL / 2).all()
     areas = torch.stack([hidden, static.to(guide.device)], dim=-1).to(guide)
-    photos = reduced(torch.cat([guide, areas], dim=-1), reduction).to(samples.color.device)
+    mean, deviation = reduced(guide[..., :3], reduction), reduced_deviation(guide[..., 3:], reduction)
+    photos = torch.cat([mean, deviation, reduced(areas, reduction)], dim=-1).to(samples.color.device)
     falloff = estimate_falloff(samples)
     if (falloff < 1).any():
         photos[..., :4] /= falloff

@@ -102,7 +102,7 @@ def estimate_layers(
     Args:
         samples: of the scene's points.
         mean: of the photos, [h, w, 3] in [0, 1] at the working resolution.
-        deviation: of the photos, [h, w, 1], likewise.
+        deviation: of the photos, [h, w, 1], likewise; NaN where it is unknown.
         hidden: share of a working pixel that is known to be opaque, [h, w, 1] in [0, 1].
         static: share of a working pixel where static edges are, likewise.
     """
@@ -173,7 +173,8 @@ def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tens
     and the prior would take the pixel for clear. So the residuals of a pixel that hides are those of an opaque one.
     """
     variance = deviation.flatten().square()
-    weight = (variance / variance.median().clamp_min(1e-12)).clamp_max(1.0)[samples.pixel].double() + _LEAST_WEIGHT
+    relative = (variance / variance.nanmedian().clamp_min(1e-12)).nan_to_num(1.0).clamp_max(1.0)
+    weight = relative[samples.pixel].double() + _LEAST_WEIGHT
     constant = samples.color - mean.reshape(-1, 3)[samples.pixel]
     colors = _medians(samples, weight)
     for _ in range(COLOR_ROUNDS):
@@ -208,7 +209,8 @@ def _medians(samples: PointSamples, weight: Tensor) -> Tensor:
 def _smoothness(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
     """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension."""
     change = mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True).square() + SMOOTHNESS_FLOOR**2
-    relative = deviation.diff(dim=dimension) / deviation.median().clamp_min(GRAY_LEVEL)
+    # Where the deviation is unknown, no edge of it is known.
+    relative = (deviation.diff(dim=dimension) / deviation.nanmedian().clamp_min(GRAY_LEVEL)).nan_to_num(0.0)
     return torch.cat([1 / (change + relative.square()), (1 / change).expand(-1, -1, 3)], dim=-1)
 
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence
-from ssa_nerfstudio.evidence.guided_upsampling import reduced
+from ssa_nerfstudio.evidence.guided_upsampling import reduced_deviation
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 
 MAX_OPAQUE_DEVIATION = 0.2
@@ -44,7 +44,7 @@ def artifact_area(edges: EdgeEvidence, statistics: ImageStatistics) -> ArtifactA
         statistics: likewise.
     """
     reduction = statistics.brightness.reduction
-    deviation = reduced(statistics.deviation().float(), reduction)[..., 0].cpu().numpy()
+    deviation = reduced_deviation(statistics.deviation().float(), reduction)[..., 0].cpu().numpy()
     low = low_deviation(deviation).astype(np.uint8)
     outlines = cv2.dilate(edges.outlines, _NEIGHBORS, iterations=2)
     enclosed = _areas_where(low, lambda box, area: _has_outline(outlines[box], area))
@@ -61,8 +61,13 @@ def artifact_area(edges: EdgeEvidence, statistics: ImageStatistics) -> ArtifactA
 
 
 def low_deviation(deviation: np.ndarray) -> np.ndarray:
-    """Where views vary so little that an opaque artifact may cover the pixel: bool, given the deviation [h, w]."""
-    return deviation < max(MAX_OPAQUE_DEVIATION * np.quantile(deviation, 0.75), GRAY_LEVEL / 2)
+    """Where views vary so little that an opaque artifact may cover the pixel: bool, given the deviation [h, w].
+
+    Where it is NaN nothing is known, and that is no part of what the capture's views show.
+    """
+    known = deviation[~np.isnan(deviation)]
+    usual = np.quantile(known, 0.75) if known.size else 0.0
+    return deviation < max(MAX_OPAQUE_DEVIATION * usual, GRAY_LEVEL / 2)
 
 
 def connected_parts(area: Tensor, connectivity: int = 8) -> Tensor:
@@ -83,8 +88,9 @@ def _ends_abruptly(level: np.ndarray, area: np.ndarray) -> bool:
     A path between drops of mud is an area of low deviation among static edges, too, but at its end, a drop, the
     deviation does not rise.
     """
-    outside = cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS)
-    within = area > cv2.erode(area, _NEIGHBORS, iterations=2)
+    known = ~np.isnan(level)
+    outside = known & (cv2.dilate(area, _NEIGHBORS, iterations=3) > cv2.dilate(area, _NEIGHBORS))
+    within = known & (area > cv2.erode(area, _NEIGHBORS, iterations=2))
     unbounded = not outside.any() or not within.any()
     return bool(unbounded or np.median(level[within]) <= MAX_OPAQUE_DEVIATION * np.median(level[outside]))
 

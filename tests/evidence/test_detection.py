@@ -213,6 +213,19 @@ def test_detection_is_reproducible_and_leaves_global_random_state_alone():
     assert detect(statistics, seed=1).verdict == first.verdict
 
 
+@pytest.mark.parametrize("masked", [0, 40, 60])
+def test_an_opaque_button_is_found_beside_a_mask_of_much_of_the_frame(masked):
+    """Columns that no photo shows are no part of how much the views vary."""
+    button = np.zeros((HEIGHT, WIDTH))
+    button[20:50, 80:120] = 1.0
+    mask = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    mask[:, :masked] = False
+    photos = [torch.from_numpy(photo) for photo in behind(capture(25), button)]
+    found = detect(accumulate((photo, mask) for photo in photos))
+    assert found.verdict == "opaque"
+    assert (found.opaque.numpy() == (button > 0)).mean() > 0.99
+
+
 def test_masked_pixels_cause_no_edge():
     """Black below a user's mask that is the same in all views: its outline must not be taken for an artifact."""
     seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)

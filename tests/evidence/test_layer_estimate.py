@@ -296,3 +296,25 @@ def test_layers_may_differ_between_neighbors_as_much_as_the_photos_do_there() ->
     torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + 0.25)))
     torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + 1), *[1 / floor] * 3]))
     assert (_smoothness(mean, deviation, 0) == 1 / floor).all()
+
+
+def test_pixels_that_masks_hide_do_not_change_the_smoothness_of_others() -> None:
+    """Most of the frame is masked in all photos, so its deviation is unknown."""
+    mean, deviation = torch.full((9, 4, 3), 0.2), torch.full((9, 4, 1), 0.1)
+    deviation[:, 3:] = 0.2
+    masked = deviation.clone()
+    masked[3:] = torch.nan
+    assert torch.equal(_smoothness(mean, masked, 1)[:3], _smoothness(mean, deviation, 1)[:3])
+    assert torch.isfinite(_smoothness(mean, masked, 0)).all()
+
+
+@pytest.mark.parametrize("masked", [0.0, 0.6])
+def test_layers_are_found_beside_a_mask_of_most_of_the_frame(masked: float) -> None:
+    """A plain panel in the scene's mean color, whose only edge is that of the deviation."""
+    transmittance, addition = ARTIFACTS["opaque and plain in the scene's mean color"]
+    samples, mean, deviation = observe(transmittance, addition, wrong=0.0)
+    shown = (torch.arange(WIDTH) >= masked * WIDTH).expand(HEIGHT, WIDTH)
+    deviation = torch.where(shown[..., None], deviation, torch.nan)
+    found = estimate_layers(where(samples, shown), mean, deviation, NOWHERE, NOWHERE)
+    assert (found.transmittance - transmittance)[shown].abs().mean() < 0.04
+    assert torch.isfinite(found.transmittance).all()
