@@ -102,6 +102,10 @@ class Artifacts(nn.Module):
         """The group of a training view; None where it has no overlay."""
         return self._group_of_view[view]
 
+    def photo_share(self, group: int) -> float:
+        """Share of the training views that show a group's overlay, in [0, 1]."""
+        return self._group_of_view.count(group) / len(self._group_of_view)
+
     def of_view(self, view: int) -> Overlay | None:
         """The overlay of a training view; None where it has none."""
         group = self.group_of_view(view)

@@ -61,12 +61,11 @@ class PhotoLosses(SplatfactoModel):
             target, shown = target * mask, shown * mask
         losses = {"main_loss": photometric_loss(shown, target, self.config.ssim_lambda)}
         if self._sparsity_counts():
-            learned, kind = self.artifacts.learned(), self.config.sparsity
-            terms = [
-                self._sparsity_weight(overlay) * sparsity_loss(overlay.opacity(), overlay.evidence, kind)
-                for overlay in learned
-            ]
-            losses["sparsity"] = torch.stack(terms).mean() if terms[1:] else terms[0]
+            learned = self.artifacts.learned()  # all overlays, or none
+            # Of all overlays at every step, each as often as its photos are shown.
+            shares = [self.artifacts.photo_share(group) for group in range(len(learned))]
+            terms = [self._sparsity(overlay, share) for overlay, share in zip(learned, shares, strict=True)]
+            losses["sparsity"] = torch.stack(terms).sum() if terms[1:] else terms[0]
         return losses
 
     def _recorded_losses(self, drawn: dict[str, Any], batch: dict) -> dict[str, Tensor]:
@@ -99,9 +98,11 @@ class PhotoLosses(SplatfactoModel):
         drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
         return found
 
-    def _sparsity_weight(self, overlay: ScreenSpaceOverlay) -> float | Tensor:
+    def _sparsity(self, overlay: ScreenSpaceOverlay, share: float) -> Tensor:
         stated = self.config.sparsity_weight
-        return sparsity_weight(overlay.noise.squeeze()) if stated is None else stated
+        weight = sparsity_weight(overlay.noise.squeeze()) if stated is None else stated
+        loss = weight * sparsity_loss(overlay.opacity(), overlay.evidence, self.config.sparsity)
+        return loss if share == 1 else share * loss
 
     def _sparsity_counts(self) -> bool:
         return self.training and self.config.sparsity != "off" and bool(self.artifacts.learned())

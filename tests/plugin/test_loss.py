@@ -11,6 +11,8 @@ from nerfstudio.models.splatfacto import resize_image
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.photometric import photometric_loss
 from ssa_nerfstudio.overlay.sparsity import MAX_WEIGHT, sparsity_loss
+from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.training.schedules import scaled
 
@@ -32,11 +34,11 @@ def trainer(tiny_scene, tmp_path_factory, configure_training):
 def model(trainer):
     """Its model while training, with the settings that a test changes put back."""
     settings = copy.copy(trainer.pipeline.model.config)
-    overlays = trainer.pipeline.model.artifacts.overlays
+    artifacts = trainer.pipeline.model.artifacts
     trainer.pipeline.train()
     yield trainer.pipeline.model
     trainer.pipeline.model.config = settings
-    trainer.pipeline.model.artifacts.overlays = overlays
+    trainer.pipeline.model.artifacts = artifacts
     trainer.pipeline.model.step = 0
 
 
@@ -85,7 +87,9 @@ def test_the_loss_of_a_test_photo_is_of_the_clean_render(model):
     assert_close(losses(model)["main_loss"], rendered)
 
 
-def test_several_overlays_weigh_as_much_as_one(model):
+@pytest.mark.parametrize("groups", [(0, 1), (0, 0, 0, 1), (0, 2, 1, 2)], ids=str)
+def test_overlays_weigh_as_much_as_the_photos_that_show_them(model, groups):
+    """The last of three groups has no overlay, and its photos no sparsity."""
     one = losses(model)["sparsity"]
     weight = MAX_WEIGHT  # of photos whose noise nobody knows
     own = model.artifacts.learned()[0]
@@ -93,9 +97,12 @@ def test_several_overlays_weigh_as_much_as_one(model):
     other = ScreenSpaceOverlay(48, 64).to(model.device)
     with torch.no_grad():
         other.alpha_logits.add_(3)
-    model.artifacts.overlays = torch.nn.ModuleList([own, other])
-    second = weight * sparsity_loss(other.opacity(), other.evidence, "log")
-    assert_close(losses(model)["sparsity"], (one + second) / 2)
+    of_views = [groups[view % len(groups)] for view in range(model.num_train_data)]
+    model.artifacts, count = Artifacts(), 1 + max(groups)
+    model.artifacts.assign([own, other, None][:count], torch.zeros(count, 6), of_views, torch.zeros(count, LENS_VALUES))
+    first, second = (of_views.count(group) / len(of_views) for group in (0, 1))
+    expected = weight * sparsity_loss(other.opacity(), other.evidence, "log")
+    assert_close(losses(model)["sparsity"], first * one + second * expected)
 
 
 @pytest.mark.parametrize(
