@@ -12,7 +12,13 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.overlay.compositing import composite, composite_logits, composite_over_splats
-from ssa_nerfstudio.overlay.resampling import letterbox, premultiply, reduced_size, to_training_scale
+from ssa_nerfstudio.overlay.resampling import (
+    letterbox,
+    premultiply,
+    reduced_size,
+    smallest_matte,
+    to_training_scale,
+)
 
 CONSTANT_INITIALIZATION = (0.5, 0.1)
 """Initial color and matte of the paper's ablation "constant start"."""
@@ -88,6 +94,36 @@ class ScreenSpaceOverlay(nn.Module):
         """Clamp the parameters to MATTE_LOGIT_RANGE and COLOR_LOGIT_RANGE, where a gradient can still move them."""
         self.alpha_logits.clamp_(*MATTE_LOGIT_RANGE)
         self.color_logits.clamp_(*COLOR_LOGIT_RANGE)
+
+    @torch.no_grad()
+    def clearest(self, share: float) -> tuple[Tensor, Tensor]:
+        """T [] and B [3] on the mean over the pixels that hide least, a share of the frame in (0, 1]."""
+        transmittance, addition = self.layers()
+        opacity = smallest_matte(transmittance, addition).flatten()
+        pixels = opacity.topk(max(1, round(share * len(opacity))), largest=False, sorted=False).indices
+        return transmittance.flatten()[pixels].mean(), addition.reshape(-1, 3)[pixels].mean(dim=0)
+
+    @torch.no_grad()
+    def clear(self, transmittance: Tensor, addition: Tensor) -> None:
+        """Leave a film out that the scene shows from now on: C becomes T C + B of its T [] and B [3].
+
+        The composite stays the same, T / T_film (T_film C + B_film) + B - T / T_film B_film, but for pixels clearer
+        than the film, which become clear.
+        """
+        hidden_by, shown = self.matte(), self.color()
+        through = self.falloff * (1 - hidden_by) / transmittance
+        falloff = (self.falloff / transmittance).clamp_max(1.0) if self.falloff.numel() > 1 else self.falloff
+        own = self.falloff * (shown if self.adds_light else hidden_by * shown) - through * addition
+        through, own = (through / falloff).clamp_max(1.0), (own / falloff).clamp(0.0, 1.0)
+        if self.adds_light:
+            matte, color = 1 - through, own
+        else:
+            matte = smallest_matte(through, own)
+            color = (own + 1e-6 * shown) / (matte + 1e-6)  # a clear pixel keeps its color
+        self.color_logits.copy_(color.logit())
+        self.alpha_logits.copy_(matte.logit())
+        self.falloff.copy_(falloff)
+        self.clamp_logits()
 
     def color(self) -> Tensor:
         """W: straight color, or additive light, [h, w, 3] in (0, 1)."""

@@ -98,6 +98,11 @@ class Artifacts(nn.Module):
         """The overlays with parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
 
+    @property
+    def of_all_photos(self) -> bool:
+        """Whether every training view has an overlay."""
+        return None not in self._group_of_view
+
     def group_of_view(self, view: int) -> int | None:
         """The group of a training view; None where it has no overlay."""
         return self._group_of_view[view]

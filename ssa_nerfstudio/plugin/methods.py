@@ -109,6 +109,7 @@ ssa_splatfacto_paper = MethodSpecification(
             overlay="on",
             overlay_start="statistics",
             overlay_intervals="off",
+            overlay_film="kept",
             sparsity="l1",
             sparsity_weight=0.05,
             background_color="black",

@@ -27,6 +27,7 @@ from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
 from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.regularizers import regularizers
+from ssa_nerfstudio.plugin.training.scene_brightness import clear_the_clearest
 from ssa_nerfstudio.plugin.training.seed_points import color_parameters, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
@@ -131,6 +132,18 @@ class SSASplatfactoModel(PhotoLosses):
         if self.exposure is not None:
             self.exposure.project()
         super().step_post_backward(step)
+
+    def end_training(self, step: int) -> None:
+        """After the last step: the scene gets the brightness of the photos' clearest pixels.
+
+        Not where some photos have no overlay, which fix the brightness, nor where something else stands between the
+        scene and a photo, as exposure or a bilateral grid does.
+        """
+        if self.config.overlay_film == "kept" or self.exposure is not None or self.config.use_bilateral_grid:
+            return
+        learned = self.artifacts.learned()
+        if learned and self.artifacts.of_all_photos:
+            clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.

@@ -34,6 +34,9 @@ class ModelSettings(SplatfactoModelConfig):
     overlay_intervals: Literal["auto", "off"] = "auto"
     """auto: where the artifact changes in the order of the photos, learn an overlay for each interval; off: one for all
     photos of a camera."""
+    overlay_film: Literal["cleared", "kept"] = "cleared"
+    """A film over all of the frame that the training has learned. cleared: after the last step it becomes a part of the
+    scene, which so has the brightness of the photos' clearest pixels; kept: as it was learned, as in the paper."""
     overlay_downscale: Literal[1, 2, 4] = 1
     """Side of the block of photo pixels per overlay pixel: 1, 1/2 or 1/4 of the photos' resolution."""
     exposure: Literal["off", "affine"] = "off"

@@ -141,7 +141,10 @@ class SSATrainer(Trainer):
                     raise InputError(f"--vis {self.config.vis}: {error}", "or choose --vis tensorboard") from error
                 raise
         thin_event_writers(self.config.logging.steps_per_log)
-        self.callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN], self._report_artifact))
+        last = (self.config.max_num_iterations - 1,)
+        ending, ended = TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
+        self.callbacks.append(TrainingCallback([ending], self.pipeline.model.end_training, iters=last))
+        self.callbacks.append(TrainingCallback([ended], self._report_artifact))
 
     def _report_artifact(self, step: int) -> None:
         artifacts = self.pipeline.model.artifacts

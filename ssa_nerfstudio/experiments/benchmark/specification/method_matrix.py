@@ -5,7 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-_PAPER = {"overlay": "on", "overlay_start": "statistics", "sparsity": "l1", "ignore_background": False}
+_PAPER = {
+    "overlay": "on",
+    "overlay_start": "statistics",
+    "overlay_film": "kept",
+    "sparsity": "l1",
+    "ignore_background": False,
+}
 """The paper's overlay, sparsity weight apart."""
 
 
