@@ -61,7 +61,7 @@ class LayerEstimate:
     unexplained: Tensor
     """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers; NaN without any."""
     noise: Tensor = field(default_factory=lambda: torch.ones(()))
-    """Robust deviation of the samples from these layers, [] in (0, 1]; 1: unknown."""
+    """Robust deviation of the samples from layers and colors before the last turn, [] in (0, 1]; 1: unknown."""
 
     def opacity(self) -> Tensor:
         """The least matte [h, w, 1] that explains T and B."""
@@ -156,7 +156,7 @@ def estimate_layers(
 
 
 def robust_deviation(residuals: Tensor) -> Tensor:
-    """Standard deviation of residuals, [], from the median of their lengths; at least that of rounded photos."""
+    """Standard deviation of residuals, [], from the median of their sizes; at least that of rounded photos."""
     return 1.48 * residuals.abs().median() + GRAY_LEVEL
 
 

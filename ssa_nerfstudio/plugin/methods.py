@@ -93,7 +93,7 @@ ssa_splatfacto = MethodSpecification(
 
 ssa_splatfacto_fast = MethodSpecification(
     config=_trainer("ssa-splatfacto-fast", SSASplatfactoModelConfig(), FAST_LENGTH),
-    description="ssa-splatfacto in 4,000 steps, with ADC: 20 seconds or less on a fast GPU, and a decibel behind it.",
+    description="ssa-splatfacto in 4,000 steps, with ADC: about 20 seconds on a fast GPU, and a decibel behind it.",
 )
 
 ssa_splatfacto_mcmc = MethodSpecification(

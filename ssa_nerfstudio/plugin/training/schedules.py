@@ -16,7 +16,8 @@ DEFAULT_LENGTH = 15_000
 FAST_LENGTH = 4_000
 """The shortest length of ADC that was within half a decibel of its 7000 steps on every capture (docs/cost.md)."""
 MCMC_LENGTH = 7_000
-"""With 7000 steps MCMC is as good as ADC, or better, on every capture, with 4000 behind on most (docs/cost.md)."""
+"""With 7000 steps MCMC is as good as ADC on the mean of two captures, and better on two; with 4000 it is behind on most
+(docs/cost.md)."""
 MIN_REFINE_EVERY = 10
 """Lower bound of the steps between two refinements, whose statistics need a few views."""
 MIN_STEPS_PER_IMAGE = 100
