@@ -147,11 +147,19 @@ def check_reader(reader: DataParserConfig) -> None:
 
 
 def check_device(device: torch.device | str) -> None:
-    """Refuse CUDA where there is none."""
-    if torch.device(device).type == "cuda" and not torch.cuda.is_available():
+    """Refuse CUDA where there is none, and a GPU that is not the current one, on which kernels would be launched."""
+    device = torch.device(device)
+    if device.type != "cuda":
+        return
+    if not torch.cuda.is_available():
         raise InputError(
             "the device is cuda, and torch finds no CUDA on this machine",
             "add --machine.device-type cpu, or install a torch build for your driver",
+        )
+    if device.index not in (None, torch.cuda.current_device()):
+        raise InputError(
+            f"the device is {device}, and the current one is cuda:{torch.cuda.current_device()}",
+            f"call torch.cuda.set_device({device.index}) first, or start with CUDA_VISIBLE_DEVICES={device.index}",
         )
 
 

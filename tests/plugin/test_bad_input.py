@@ -16,7 +16,7 @@ from nerfstudio.engine.schedulers import ExponentialDecaySchedulerConfig
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.training.fused_adam import FusedAdamConfig
-from ssa_nerfstudio.plugin.validation import check_optimizers
+from ssa_nerfstudio.plugin.validation import check_device, check_optimizers
 
 
 def refusal(run: Callable) -> str:
@@ -120,6 +120,14 @@ def test_cuda_where_there_is_none_is_refused_with_the_flag_that_helps(
     config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2)
     config.machine.device_type = "cuda"
     assert "--machine.device-type cpu" in refusal(lambda: train_and_evaluate(config))
+
+
+def test_a_gpu_that_is_not_the_current_one_is_refused(monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "current_device", lambda: 0)
+    check_device("cuda")
+    check_device("cuda:0")
+    assert "torch.cuda.set_device(1)" in refusal(lambda: check_device("cuda:1"))
 
 
 def test_resuming_with_photos_of_another_size_is_refused(tiny_scene, tmp_path, configure_training, train_and_evaluate):
