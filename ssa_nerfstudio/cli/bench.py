@@ -29,7 +29,7 @@ class Command:
     """Folder of the results; an earlier one is brought up to date, a finished run is never repeated."""
     benchmark: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="BENCHMARK")] = "smoke"
     """smoke, captures, captures-cpu, games, games-cpu, baselines, exposure, exposure-captures, gaussian-counts,
-    lengths, mipnerf360, two-pass, or a .yaml file."""
+    lengths, photo-scales, mipnerf360, two-pass, or a .yaml file."""
     scenes: tuple[str, ...] = ()
     """Only these scenes."""
     only: tuple[str, ...] = ()
