@@ -179,7 +179,7 @@ class Artifacts(nn.Module):
         return f"{fraction:.1%} of the frame more than half {covered}, mean matte {mean:.3f}"
 
     def allocate(self, state: dict[str, Any], prefix: str, wanted: bool) -> None:
-        """Allocate overlays of a checkpoint's shapes, or check that they fit those that are being trained.
+        """Allocate overlays of a checkpoint's shapes for its cameras, or check that they fit those being trained.
 
         Args:
             state: the model's state dict; entries that older versions lack are added, and others dropped.
@@ -222,8 +222,8 @@ class Artifacts(nn.Module):
             else ScreenSpaceOverlay(h, w, resolution, bool(light))
             for h, w, resolution, light in frames
         ).to(device)
-        for name in ("camera_keys", "lenses", "bare_keys"):
-            setattr(self, name, getattr(self, name).new_zeros(state.get(prefix + name, getattr(self, name)).shape))
+        for name in ("camera_keys", "lenses", "bare_keys"):  # their values, too: a resumed run asks before it loads
+            setattr(self, name, state.get(prefix + name, getattr(self, name)).to(self.camera_keys, copy=True))
         self._allocate_optional(state, prefix)
 
     def _allocate_optional(self, state: dict[str, Any], prefix: str) -> None:
@@ -268,7 +268,7 @@ class Artifacts(nn.Module):
                     "resume with the photos and camera-res-scale-factor it was trained with",
                 )
             places.append(place)
-        self._keys, self._bare = known[: len(self)].tolist(), known[len(self) :].tolist()
+        self._remember_keys()
         self.set_extra_state(_extra_state_in(state, prefix))
         found = [self.at_photo(places[group], photo) for group, photo in zip(groups, photos, strict=True)]
         self._group_of_view = [place if place < len(self) else None for place in found]

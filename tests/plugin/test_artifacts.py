@@ -35,6 +35,17 @@ def test_cameras_are_known_again_to_the_last_bit():
     assert torch.equal(made.bare_keys, KEYS[1:])
 
 
+def test_a_resumed_run_knows_its_cameras_before_it_has_loaded_the_checkpoint():
+    """Without any change to what is loaded later."""
+    stored, made = state(), Artifacts()
+    made.resume_from(stored, "a.", KEYS, [0, 1], "auto", ["0.png", "1.png"])
+    assert torch.equal(made.camera_keys, KEYS[:1])
+    assert torch.equal(made.bare_keys, KEYS[1:])
+    assert torch.equal(made.lenses, stored["a.lenses"])
+    assert made.camera_keys.data_ptr() != stored["a.camera_keys"].data_ptr()
+    assert [made.group_of_view(view) for view in (0, 1)] == [0, None]
+
+
 @pytest.mark.parametrize("frame", [(0, 4), (30_000, 30_000)])
 def test_an_overlay_of_a_size_that_no_photo_has(frame):
     stored = state()

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -129,9 +132,10 @@ def test_added_light_goes_over_borders_as_far_as_a_matte_can_hold_it():
     assert compared > 100
 
 
-def test_a_training_of_faces_shares_and_others_do_not(tmp_path, tiny_scene, configure_training, monkeypatch):
-    """A capture of two of a panorama's faces, whose overlays are apart before the step."""
-    data = tmp_path / "faces"
+@pytest.fixture(scope="module")
+def two_faces(tiny_scene, tmp_path_factory) -> Path:
+    """A capture of two of a panorama's faces."""
+    data = tmp_path_factory.mktemp("two") / "faces"
     shutil.copytree(tiny_scene, data)
     content = json.loads((data / "transforms.json").read_text())
     size = 48
@@ -145,15 +149,27 @@ def test_a_training_of_faces_shares_and_others_do_not(tmp_path, tiny_scene, conf
         content.pop(key, None)
     content |= panorama_entry(2 * size, [Face("front", size), Face("right", size)])
     (data / "transforms.json").write_text(json.dumps(content))
+    return data
 
-    def pipeline(folder, scene):
+
+@pytest.fixture(scope="module")
+def trainer_of(configure_training) -> Callable[..., Any]:
+    """A trainer that has been set up, given the folder of its run, the scene and the checkpoints to resume from."""
+
+    def set_up(folder: Path, scene: Path, resumed: Path | None = None):
         config = configure_training("ssa-splatfacto", scene, folder, 20, {"overlay": "on", "num_downscales": 0})
+        config.load_dir = resumed
         config.set_timestamp()
         trainer = config.setup(local_rank=0, world_size=1)
         trainer.setup()
         return trainer
 
-    trainer = pipeline(tmp_path / "a", data)
+    return set_up
+
+
+def test_a_training_of_faces_shares_and_others_do_not(tmp_path, two_faces, tiny_scene, trainer_of, monkeypatch):
+    """The overlays are apart before the step."""
+    trainer = trainer_of(tmp_path / "a", two_faces)
     shared = []
     monkeypatch.setattr(SharedSphere, "share", lambda self: shared.append(self))
     attributes = TrainingCallbackAttributes(trainer.optimizers, trainer.grad_scaler, trainer.pipeline, trainer)
@@ -161,4 +177,22 @@ def test_a_training_of_faces_shares_and_others_do_not(tmp_path, tiny_scene, conf
         for callback in trainer.pipeline.get_training_callbacks(attributes)[-1:]:
             callback.run_callback(step)
     assert shared == [trainer.pipeline.sphere] * 2
-    assert pipeline(tmp_path / "b", tiny_scene).pipeline.sphere is None
+    assert trainer_of(tmp_path / "b", tiny_scene).pipeline.sphere is None
+
+
+def test_a_resumed_training_of_faces_shares_as_the_first_one_did(tmp_path, two_faces, trainer_of):
+    """What a pixel repeats is the same in both, and it is the loaded overlays that do."""
+    first = trainer_of(tmp_path / "first", two_faces)
+    with torch.no_grad():
+        for overlay in first.pipeline.model.artifacts.learned():
+            overlay.alpha_logits.normal_()
+    first.save_checkpoint(3)
+    resumed = trainer_of(tmp_path / "resumed", two_faces, first.checkpoint_dir)
+    assert resumed.pipeline.sphere is not None
+    before, after = (each.pipeline.model.artifacts.learned() for each in (first, resumed))
+    apart = [overlay.alpha_logits.clone() for overlay in after]
+    for trainer in (first, resumed):
+        trainer.pipeline.sphere.share()
+    for a, b, unshared in zip(before, after, apart, strict=True):
+        assert torch.equal(a.alpha_logits, b.alpha_logits)
+        assert not torch.equal(b.alpha_logits, unshared)
