@@ -156,7 +156,7 @@ class ScreenSpaceOverlay(nn.Module):
         if self.resolution == reduction == 1 and not self.adds_light:
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         else:
-            layers = self._before_falloff(reduction)
+            layers = self.before_falloff(reduction)
             if behind is None:
                 image = composite(clean, *layers)
             else:
@@ -172,13 +172,14 @@ class ScreenSpaceOverlay(nn.Module):
         Returns:
             Transmittance T [H // reduction, W // reduction, 1] and addition B [H // reduction, W // reduction, 3].
         """
-        transmittance, addition = self._before_falloff(reduction)
+        transmittance, addition = self.before_falloff(reduction)
         if self.falloff.numel() == 1:
             return transmittance, addition
         falloff = self._at_training_scale(self.falloff, reduction)
         return falloff * transmittance, falloff * addition
 
-    def _before_falloff(self, reduction: int) -> tuple[Tensor, Tensor]:
+    def before_falloff(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
+        """As `layers`, without the falloff of the lens: what is in front of the scene alone."""
         if self.adds_light:
             transmittance, addition = 1.0 - self.matte(), self.color()
         else:

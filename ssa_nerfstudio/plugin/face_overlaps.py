@@ -13,7 +13,7 @@ from ssa_nerfstudio.data.panorama_entry import Panorama
 from ssa_nerfstudio.evidence.initialization import initialize_as
 from ssa_nerfstudio.evidence.point_samples import working_reduction
 from ssa_nerfstudio.evidence.static_area import MIN_AREA
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import OPTIONAL_BUFFERS, ScreenSpaceOverlay
 
 HIDDEN = 0.5
 """Transmittances below this hide the scene."""
@@ -47,17 +47,18 @@ def joined_overlays(
         resolution: of overlays (`ScreenSpaceOverlay`).
 
     Returns:
-        By the face's number: of those faces alone whose own overlay, or the lack of one, misses a part of that.
+        By the face's number: of those faces alone whose own overlay, or the lack of one, misses a part of that. What
+        else is known of a face's photos (OPTIONAL_BUFFERS of its own overlay) stays.
     """
     clear = np.tile(np.array([1, 0, 0, 0], np.float32), (faces[0].size, faces[0].size, 1))
     known = {
-        face: torch.cat(overlay.layers(), dim=-1).cpu().numpy()
+        face: torch.cat(overlay.before_falloff(), dim=-1).cpu().numpy()
         for face, overlay in zip(faces, overlays, strict=True)
         if overlay is not None
     }
     smallest = MIN_AREA * working_reduction(*clear.shape[:2]) ** 2
     joined = {}
-    for number, face in enumerate(faces):
+    for number, (face, overlay) in enumerate(zip(faces, overlays, strict=True)):
         own, others = known.get(face, clear), [(other, layers) for other, layers in known.items() if other != face]
         beside = hidden_by_neighbors(face, others)
         if ((beside[..., 0] < HIDDEN) & (own[..., 0] >= HIDDEN)).sum() >= smallest:
@@ -65,4 +66,6 @@ def joined_overlays(
             joined[number] = ScreenSpaceOverlay(face.size, face.size, resolution)
             both = np.where(beside[..., :1] < own[..., :1], beside, own)
             initialize_as(joined[number], torch.from_numpy(both))
+            for name in OPTIONAL_BUFFERS if overlay is not None else ():
+                setattr(joined[number], name, getattr(overlay, name).to(joined[number].evidence, copy=True))
     return joined

@@ -14,7 +14,7 @@ from nerfstudio.cameras.cameras import Cameras
 from ssa_nerfstudio.cameras.panorama import cut, panorama_faces
 from ssa_nerfstudio.data.panorama_entry import Panorama
 from ssa_nerfstudio.evidence.initialization import initialize_as
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import OPTIONAL_BUFFERS, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.face_overlaps import faces_of, joined_overlays
 from ssa_nerfstudio.plugin.model import SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import learned_overlays
@@ -52,6 +52,36 @@ def test_what_reaches_over_the_border_of_a_face_starts_in_its_neighbors():
         assert transmittance[hidden].mean() < 0.1
         assert addition[hidden].mean() == pytest.approx(COLOR, abs=0.03)
         assert transmittance[clear].mean() > 0.98
+
+
+def test_a_face_keeps_what_is_known_of_its_own_photos():
+    """Noise, where its artifact changes, and its lens's falloff, which is no artifact on either side of a border."""
+    size = FACES[0].size
+    front, down = next(each for each in FACES if each.name == "front"), operator_below(-44.0, "down")
+    box = slice(size // 2 - 10, size // 2 + 10)
+    logo = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(size, size, 1)
+    logo[box, box] = torch.tensor([0.0, 0.3, 0.2, 0.1])
+    own, below = overlay_of(logo), overlay_of(down)
+    own.noise.fill_(0.008)
+    own.reliable = torch.ones(size, size, 1)
+    own.reliable[box, box] = 0
+    row = torch.linspace(0.4, 1.0, size)[:, None, None].expand(size, size, 1)
+    own.falloff, below.falloff = row.clone(), row.flip(0)
+    overlays = [{"front": own, "down": below}.get(face.name) for face in FACES]
+    joined = joined_overlays(FACES, overlays, 1)
+    number = FACES.index(front)
+    found = joined[number]
+    for name in OPTIONAL_BUFFERS:
+        assert torch.equal(getattr(found, name), getattr(own, name))
+    transmittance, addition = (layer.detach() for layer in found.layers())
+    truth = operator_below(-44.0, "front")
+    hidden, clear = truth[..., 0] < 0.1, (truth[..., 0] > 0.9) & (logo[..., 0] > 0.9)
+    torch.testing.assert_close(transmittance[clear], row[clear], atol=0.02, rtol=0)
+    assert (addition / row)[hidden].mean() == pytest.approx(COLOR, abs=0.03)
+    torch.testing.assert_close((addition / row)[box, box], logo[box, box, 1:], atol=0.01, rtol=0)
+    other = joined[next(n for n in joined if n != number)]
+    assert [getattr(other, name).tolist() for name in OPTIONAL_BUFFERS] == [[[[1.0]]]] * 3, "nothing is known of it"
+    assert {FACES[n].name for n in joined} == {"front", "right", "back", "left"}
 
 
 def test_a_strip_too_small_to_be_found_gets_an_overlay_and_one_line(capsys):
