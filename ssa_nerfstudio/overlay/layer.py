@@ -161,7 +161,7 @@ class ScreenSpaceOverlay(nn.Module):
                 image = composite(clean, *layers)
             else:
                 image = composite_over_splats(clean, *behind, *layers, self.adds_light)
-        return image if self.falloff.numel() == 1 else image * self._at_training_scale(self.falloff, reduction)
+        return image if self.falloff.numel() == 1 else image * self.falloff_at(reduction)
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
         """Resample the overlay to training images, averaged premultiplied.
@@ -175,7 +175,7 @@ class ScreenSpaceOverlay(nn.Module):
         transmittance, addition = self.before_falloff(reduction)
         if self.falloff.numel() == 1:
             return transmittance, addition
-        falloff = self._at_training_scale(self.falloff, reduction)
+        falloff = self.falloff_at(reduction)
         return falloff * transmittance, falloff * addition
 
     def before_falloff(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
@@ -188,6 +188,12 @@ class ScreenSpaceOverlay(nn.Module):
             return transmittance, addition
         pair = self._at_training_scale(torch.cat([transmittance, addition], dim=-1), reduction)
         return pair[..., :1], pair[..., 1:]
+
+    def falloff_at(self, reduction: int = 1) -> Tensor:
+        """The falloff F of the lens [H // reduction, W // reduction, 1], in (0, 1]."""
+        if self.falloff.numel() == 1:
+            return self.falloff.expand(self.height // reduction, self.width // reduction, 1)
+        return self._at_training_scale(self.falloff, reduction)
 
     def _at_training_scale(self, layer: Tensor, reduction: int) -> Tensor:
         if self.resolution == reduction == 1:

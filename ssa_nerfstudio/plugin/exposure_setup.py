@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -11,6 +12,7 @@ from torch import Tensor
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.photo_exposure import artifact_follows, relative_gains, sample_each
 from ssa_nerfstudio.evidence.point_samples import PointSamples, working_reduction
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.artifacts import Artifacts, Overlay
 from ssa_nerfstudio.plugin.decisions import tell
 from ssa_nerfstudio.plugin.exposure import Exposure, Place
@@ -58,9 +60,14 @@ def start_beside_artifact(
     # Photos, and with them samples, may be cached elsewhere than on the training's device.
     device = samples[0].color.device
     overlays = [artifacts[number] for number in range(len(artifacts))]
-    found = {overlay: _working_layers(overlay).to(device) for overlay in overlays}
+    found = {overlay: _working_layers(overlay).to(device).split((4, 1), dim=-1) for overlay in overlays}
     shown = [artifacts.of_view(view) for view in range(len(samples))]
-    layers = [None if overlay is None else found[overlay] for overlay in shown]
+    layers = [None if overlay is None else found[overlay][0] for overlay in shown]
+    # A lens's falloff hides nothing: samples are divided by it.
+    samples = [
+        each if overlay is None else replace(each, color=each.color / found[overlay][1].reshape(-1, 1)[each.pixel])
+        for each, overlay in zip(samples, shown, strict=True)
+    ]
     log_gains = relative_gains(samples, layers)
     with torch.no_grad():
         exposure.transforms[:, 0] = log_gains
@@ -75,7 +82,11 @@ def start_beside_artifact(
 
 @torch.no_grad()
 def _working_layers(overlay: Overlay) -> Tensor:
-    """T and B [h, w, 4] at the working size of point samples."""
-    transmittance, addition = overlay.layers()
-    both = torch.cat([transmittance.mean(dim=-1, keepdim=True), addition], dim=-1)
-    return reduced(both, working_reduction(overlay.height, overlay.width))
+    """T and B before the lens's falloff, and the falloff, [h, w, 5], at the working size of point samples."""
+    if isinstance(overlay, ScreenSpaceOverlay):
+        (transmittance, addition), falloff = overlay.before_falloff(), overlay.falloff_at()
+    else:
+        transmittance, addition = overlay.layers()
+        falloff = torch.ones_like(addition[..., :1])
+    everything = torch.cat([transmittance.mean(dim=-1, keepdim=True), addition, falloff], dim=-1)
+    return reduced(everything, working_reduction(overlay.height, overlay.width))
