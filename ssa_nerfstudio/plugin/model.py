@@ -74,7 +74,7 @@ class SSASplatfactoModel(PhotoLosses):
         self.scene_scale = 1.0
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
         self.register_buffer("by_mcmc", torch.tensor(self.config.strategy == "mcmc"))
-        self._near_plane = NEAR_PLANE
+        self._near_plane, self._near_plane_is_set = NEAR_PLANE, False
         self.metrics_every = 10
         self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
@@ -112,9 +112,13 @@ class SSASplatfactoModel(PhotoLosses):
         """Called with photos and cameras before the optimizers are built; for a subclass that needs them."""
 
     def set_near_plane(self, nearest: float | None) -> None:
-        """Set what cameras do not draw by the depth of the nearest seed points (world units; None: unknown)."""
+        """Set what cameras do not draw by the depth of the nearest seed points (world units; None: unknown).
+
+        A training that goes on from a checkpoint keeps what was set; whoever only renders takes the checkpoint's.
+        """
         self._near_plane = max(NEAR_PLANE, self.config.clearance * (nearest or 0.0))
         self.near_plane.fill_(self._near_plane)
+        self._near_plane_is_set = True
 
     def start_outside_cameras(self, positions: Tensor) -> None:
         """Drop seed points inside a camera at positions [V, 3]; call it before the optimizers are built."""
@@ -157,6 +161,8 @@ class SSASplatfactoModel(PhotoLosses):
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         fit_checkpoint(self.exposure, dict, "exposure.")
+        if self.training and self._near_plane_is_set:  # a resumed run has its own clearance
+            dict["near_plane"] = self.near_plane
         dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored
         dict["by_mcmc"] = self.by_mcmc
         loaded = super(SplatfactoModel, self).load_state_dict(dict, **kwargs)

@@ -138,7 +138,9 @@ class SSAPipeline(VanillaPipeline):
 
     def _set_near_plane(self) -> None:
         config, seeds, cameras = self.config.model, self.model.seed_points, self.datamanager.train_dataset.cameras
-        if config.clearance and seeds is not None and len(seeds[0]):
+        if not config.clearance:
+            self.model.set_near_plane(None)
+        elif seeds is not None and len(seeds[0]):
             size = int(cameras.width.max()), int(cameras.height.max())
             poses, Ks = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
             self.model.set_near_plane(nearest_depth(seeds[0], poses, Ks, *size))

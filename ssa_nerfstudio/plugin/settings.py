@@ -87,6 +87,7 @@ class ModelSettings(SplatfactoModelConfig):
     """Guards: number of skipped steps in a row that ends the training, checked every 100 steps."""
     clearance: float = 0.5
     """A camera does not draw Gaussians nearer than this share of the depth of the nearest seed points, in [0, 1):
-    no surface is there, only floaters that fill the picture of a camera nearby. 0: gsplat's near plane of 0.01."""
+    no surface is there, only floaters that fill the picture of a camera nearby. 0: gsplat's near plane of 0.01.
+    A resumed run takes its own value, not the checkpoint's."""
     rasterizer: RasterizerName = "auto"
     """auto: gsplat on CUDA, the numba splatter on a CPU; reference: plain torch, slow."""

@@ -307,6 +307,27 @@ def test_mcmc_that_goes_on_from_adc_keeps_its_clearance(
     assert float(pipeline.model.near_plane) == plane
 
 
+@pytest.mark.parametrize(("trained", "stated"), [(0.5, 0.2), (0.5, 0.0), (0.0, 0.5)])
+def test_a_resumed_run_has_its_own_clearance_and_what_loads_a_checkpoint_that_of_the_training(
+    trained, stated, tiny_scene, tmp_path, run, configure_training, train_and_evaluate
+):
+    """In units of the depth of the nearest points: another run of the same photos says what that is."""
+    _, usual, _ = run(tiny_scene, tmp_path / "usual", 1, overlay="off", clearance=0.5)
+    nearest = float(usual.model.near_plane) / 0.5
+    planes = {share: max(NEAR_PLANE, share * nearest) for share in (trained, stated)}
+    _, first, path = run(tiny_scene, tmp_path / "first", 4, overlay="off", clearance=trained)
+    assert float(first.model.near_plane) == pytest.approx(planes[trained])
+    settings = {"num_downscales": 0, "overlay": "off", "clearance": stated}
+    resumed = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "resumed", 6, settings)
+    resumed.load_dir = path.parent / "nerfstudio_models"
+    _, pipeline, again = train_and_evaluate(resumed)
+    assert float(pipeline.model.near_plane) == pytest.approx(planes[stated])
+    assert pipeline.model._near_plane == pytest.approx(planes[stated])
+    for config, share in ((path, trained), (again, stated)):
+        _, reloaded, _, _ = eval_setup(config, test_mode="inference")
+        assert reloaded.model._near_plane == pytest.approx(planes[share])
+
+
 def test_every_schedule_is_scaled_with_the_length_of_the_run():
     config = copy.deepcopy(METHODS["ssa-splatfacto-mcmc"])
     config.max_num_iterations = 7_000
