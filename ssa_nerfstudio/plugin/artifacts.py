@@ -16,6 +16,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.overlay.layer import OPTIONAL_BUFFERS, OracleOverlay, ScreenSpaceOverlay, letterboxed_layers
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.camera_matching import LENS_VALUES, find_frame, match_camera, nearest_aspect
+from ssa_nerfstudio.plugin.checkpoint_groups import cameras_in, names_in
 from ssa_nerfstudio.plugin.view_geometry import metadata
 
 Overlay = ScreenSpaceOverlay | OracleOverlay
@@ -97,11 +98,6 @@ class Artifacts(nn.Module):
     def learned(self) -> list[ScreenSpaceOverlay]:
         """The overlays with parameters."""
         return [overlay for overlay in self.overlays if isinstance(overlay, ScreenSpaceOverlay)]
-
-    @property
-    def of_all_photos(self) -> bool:
-        """Whether every training view has an overlay."""
-        return None not in self._group_of_view
 
     def group_of_view(self, view: int) -> int | None:
         """The group of a training view; None where it has no overlay."""
@@ -253,7 +249,7 @@ class Artifacts(nn.Module):
                 f"the checkpoint was trained with overlay {here}, this run has {setting}",
                 f"resume with --pipeline.model.overlay {('auto' if here == 'off' else here)}",
             )
-        known = _keys_in(state, prefix)
+        known = cameras_in(state, prefix)
         if not len(known):  # checkpoints from before groups without an overlay were recorded
             self._group_of_view = [None] * len(groups)
             return
@@ -269,7 +265,7 @@ class Artifacts(nn.Module):
                 )
             places.append(place)
         self._remember_keys()
-        self.set_extra_state(_extra_state_in(state, prefix))
+        self.set_extra_state(names_in(state, prefix))
         found = [self.at_photo(places[group], photo) for group, photo in zip(groups, photos, strict=True)]
         self._group_of_view = [place if place < len(self) else None for place in found]
 
@@ -280,29 +276,6 @@ class Artifacts(nn.Module):
         for name in ("lenses", "bare_keys"):  # checkpoints of the first version have none
             state_dict.setdefault(prefix + name, getattr(self, name))
         if prefix + "camera_keys" in state_dict:  # nerfstudio also loads an empty state into the whole pipeline
-            state_dict[f"{prefix}_extra_state"] = _extra_state_in(state_dict, prefix)
+            state_dict[f"{prefix}_extra_state"] = names_in(state_dict, prefix)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._remember_keys()
-
-
-def _keys_in(state: dict[str, Any], prefix: str) -> Tensor:
-    """Cameras of a checkpoint's groups [G, 6], of those with an overlay before the others."""
-    return torch.cat([state.get(f"{prefix}{name}", torch.zeros(0, 6)) for name in ("camera_keys", "bare_keys")])
-
-
-def _extra_state_in(state: dict[str, Any], prefix: str) -> dict[str, list[str]]:
-    """What a checkpoint holds beside the tensors; those from before intervals and names get none of the former.
-
-    Raises:
-        InputError: it is of other groups than the checkpoint has.
-    """
-    keys = _keys_in(state, prefix).tolist()
-    numbers = [[key for at, key in enumerate(keys) if key not in keys[:at]].index(key) for key in keys]
-    extra = {"starts": [BEGINNING] * len(keys), "cameras": [f"camera_{number}" for number in numbers]}
-    extra |= state.get(f"{prefix}_extra_state", {})
-    for name, values in extra.items():
-        if len(values) != len(keys):
-            raise InputError(
-                f"the {name} in the checkpoint are not one for each of its groups of photos", "take another"
-            )
-    return extra

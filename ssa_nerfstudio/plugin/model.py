@@ -146,7 +146,7 @@ class SSASplatfactoModel(PhotoLosses):
         if self.config.overlay_film == "kept" or self.exposure is not None or self.config.use_bilateral_grid:
             return
         learned = self.artifacts.learned()
-        if learned and self.artifacts.of_all_photos:
+        if learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]

@@ -200,7 +200,7 @@ def test_settings_can_be_combined(tiny_scene, tmp_path, model, configure_trainin
 
 
 def test_the_start_is_the_statistics_of_the_training_photos(tiny_scene, tmp_path, run):
-    _, pipeline, _ = run(tiny_scene, tmp_path, 1, overlay_start="statistics")
+    _, pipeline, _ = run(tiny_scene, tmp_path, 1, overlay_start="statistics", overlay_film="kept")
     photos = pipeline.datamanager.cached_train
     deviation = accumulate((photo["image"], None) for photo in photos).deviation()
     expected = torch.exp(-deviation / 0.05).clamp(0.01, 0.99).float()
