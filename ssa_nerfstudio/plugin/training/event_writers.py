@@ -8,6 +8,7 @@ from functools import reduce
 from typing import Any
 
 import torch
+from nerfstudio.configs import base_config  # noqa: F401 - before writer, which imports it, and without which it fails
 from nerfstudio.utils import writer
 from nerfstudio.utils.writer import EventName
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -27,6 +29,11 @@ class Recorder:
 
     def write_scalar(self, name: str, scalar: Any, step: int) -> None:
         self.written.append((name, scalar, step))
+
+
+def test_the_module_can_be_imported_before_any_other():
+    code = "import ssa_nerfstudio.plugin.training.event_writers"
+    subprocess.run([sys.executable, "-W", "ignore", "-c", code], check=True, timeout=100)
 
 
 def test_times_and_learning_rates_are_written_when_losses_are_logged():
