@@ -16,9 +16,6 @@ import numpy as np
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.export_overlay import Command as ExportOverlay
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.demo.comparison import ARTIFACTS, SMALL_SCENE
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
-from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 
@@ -37,6 +34,10 @@ class Command:
         """
         if self.steps < 1:
             raise InputError(f"--steps must be at least 1, got {self.steps}")
+        from ssa_nerfstudio.experiments.demo.comparison import ARTIFACTS, SMALL_SCENE
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure
+        from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+
         scene = DemoScene()
         for name, artifact in ARTIFACTS.items():
             truth = artifact().layers(scene.height, scene.width, np.random.default_rng(0))

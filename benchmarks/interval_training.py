@@ -14,8 +14,6 @@ from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.catalogue import effect_class
 from ssa_nerfstudio.experiments.effects.layers import Layers
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
-from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 
@@ -54,6 +52,9 @@ class Command:
             print(f"| {effect} | " + " | ".join(f"{value:.2f}" for value in values) + " |", flush=True)
 
     def _psnr(self, folder: Path, setting: str) -> float:
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure
+        from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+
         model = {"overlay_intervals": setting, "num_downscales": 0}
         config = configure("ssa-splatfacto", folder / "scene", folder / setting, self.steps, model)
         return train_and_evaluate(config)[0].metrics["psnr"]

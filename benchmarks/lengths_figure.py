@@ -16,12 +16,10 @@ import tyro
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
-from ssa_nerfstudio.plugin.methods import METHODS
-from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH
 
 STYLES = {"adc": "-o", "mcmc": "--s"}
-BAR = "none", "3dgs", FULL_LENGTH
-"""Effect, method and steps of the run that a capture is compared with."""
+BAR = "none", "3dgs"
+"""Effect and method of the run of full length that a capture is compared with."""
 Curves = dict[tuple[str, str], dict[int, list[Result]]]
 """Results of each capture and densification: all seeds of every number of steps."""
 PRESETS = ("ssa-splatfacto-fast", "ssa-splatfacto")
@@ -68,8 +66,10 @@ class Command:
 
 
 def _is_bar(result: Result) -> bool:
+    from ssa_nerfstudio.plugin.training.schedules import FULL_LENGTH
+
     run = result.run
-    return (run.effect, run.method, run.steps) == BAR and not run.variation
+    return (run.effect, run.method, run.steps) == (*BAR, FULL_LENGTH) and not run.variation
 
 
 def _is_of_a_curve(result: Result) -> bool:
@@ -98,6 +98,8 @@ def _draw(curves: Curves, bars: dict[str, float], path: Path) -> None:
 
     matplotlib.use("agg")
     from matplotlib import pyplot
+
+    from ssa_nerfstudio.plugin.methods import METHODS
 
     figure, axes = pyplot.subplots(figsize=(8, 4.6), constrained_layout=True)
     colors = {scene: f"C{number}" for number, scene in enumerate(sorted(bars))}

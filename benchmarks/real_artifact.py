@@ -17,8 +17,6 @@ import torch.nn.functional as F
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
-from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
 from ssa_nerfstudio.metrics.matte import matte_iou
 
@@ -49,6 +47,9 @@ class Command:
         """
         if not (self.data / MASK).is_file():
             raise InputError(f"{self.data / MASK} does not exist", "name a dataset with a mask of its artifact")
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
+        from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+
         region = ArtifactRegion.read(self.data / MASK, Dataset.read(self.data, eval_interval=8).views[0].lens)
         model = model_settings(self.settings)
         with tempfile.TemporaryDirectory() as scratch:

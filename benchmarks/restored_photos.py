@@ -17,9 +17,6 @@ from PIL import Image
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.export.artifact_layers import raw_layers, undistorted_layers
-from ssa_nerfstudio.export.checkpoint import Checkpoint
-from ssa_nerfstudio.export.restoration import NOISE, find_photos, photo_size, restore_photos
 
 BLOB = 50
 """Gray levels by which a pixel has to be wrong to be seen as part of a blob."""
@@ -44,6 +41,10 @@ class Command:
         Raises:
             InputError: no photo has a counterpart, or one cannot be restored.
         """
+        from ssa_nerfstudio.export.artifact_layers import raw_layers, undistorted_layers
+        from ssa_nerfstudio.export.checkpoint import Checkpoint
+        from ssa_nerfstudio.export.restoration import find_photos, restore_photos
+
         checkpoint = Checkpoint.read(self.load_config, None)
         frames = [*raw_layers(checkpoint), *undistorted_layers(checkpoint)]
         counterparts = {path.stem: path for path in find_photos(self.clean)}
@@ -71,6 +72,8 @@ class Command:
     def _errors(self, path: Path, truth: Path, out: Path) -> list[float]:
         """Mean squared errors of the restored and of the given photo where the artifact is, of the restored elsewhere,
         both of what is recovered; the share of the artifact that is not, and of all that is wrong by BLOB."""
+        from ssa_nerfstudio.export.restoration import NOISE
+
         photo, clean = _read(path).astype(float), _read(truth).astype(float)
         restored = _read((out / "photos" / path.relative_to(self.photos)).with_suffix(".png")).astype(float)
         height, width = photo.shape[:2]
@@ -83,6 +86,8 @@ class Command:
 
 
 def _read(path: Path) -> np.ndarray:
+    from ssa_nerfstudio.export.restoration import photo_size
+
     return read_photo(path, photo_size(path))
 
 

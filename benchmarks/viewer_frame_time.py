@@ -17,14 +17,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.viewer.render_state_machine import RenderStateMachine
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
 from ssa_nerfstudio.experiments.runs.machine import versions
-from ssa_nerfstudio.experiments.runs.run_configuration import configure
-from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 
 
 @dataclass
@@ -50,6 +47,9 @@ class Command:
         """
         if min(self.frames, self.width, self.height) < 1:
             raise InputError("--frames, --width and --height must be at least 1")
+        from ssa_nerfstudio.experiments.runs.run_configuration import configure
+        from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
+
         with TemporaryDirectory() as folder:
             config = configure("ssa-splatfacto", self.data, Path(folder), self.steps, {"overlay": "on"})
             _, pipeline, _ = train_and_evaluate(config)
@@ -88,6 +88,8 @@ class Command:
 
 def _in_a_viewer(work: Callable[[], None]) -> None:
     """Work in a thread of the viewer's class, from which the model knows that it draws for the viewer."""
+    from nerfstudio.viewer.render_state_machine import RenderStateMachine
+
     failed: list[BaseException] = []
 
     class Drawing(RenderStateMachine):

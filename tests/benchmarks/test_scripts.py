@@ -38,6 +38,15 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
     assert err == ""
 
 
+def test_no_script_imports_nerfstudio_before_it_runs():
+    """Its imports take seconds, and warn until `run_script` has begun: before all that --help and errors say."""
+    names = sorted(path.stem for path in FOLDER.glob("*.py"))
+    code = f"import {', '.join(names)}, sys; print('nerfstudio' in sys.modules)"
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=FOLDER, capture_output=True, text=True, timeout=100, check=True)
+    assert (done.stdout, done.stderr) == ("False\n", "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "said"),
     [
@@ -63,6 +72,11 @@ def test_a_script_starts_where_the_repository_is_not_on_the_path(name, monkeypat
         (["tile_list_time.py", "--help"], 0, "usage: python benchmarks/tile_list_time.py"),
         (["tile_list_time.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
         (["tile_list_time.py", "--data", "x", "--steps", "1799"], 2, "--steps must be at least 1800"),
+        (
+            ["restored_photos.py", "--load-config", "nowhere", "--photos", "x", "--clean", "x"],
+            2,
+            "nowhere does not exist",
+        ),
         (["start_accuracy.py", "--data", "nowhere"], 2, "nowhere/transforms.json does not exist"),
         (["export_speed.py", "--output", "nowhere", "--gaussians", "0"], 2, "--gaussians must be at least 1, got 0"),
         (["train.py", "--data", "nowhere", "--output", "nowhere"], 2, "nowhere/transforms.json does not exist"),
