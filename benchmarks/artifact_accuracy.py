@@ -15,7 +15,7 @@ import numpy as np
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.export_overlay import Command as ExportOverlay
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
 
@@ -23,17 +23,11 @@ from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 class Command:
     """Print the errors of matte, color and composite, for each artifact of the demo."""
 
-    steps: int = 600
-    """Training steps, at least 1."""
+    steps: Count = 600
+    """Training steps."""
 
     def run(self) -> None:
-        """Train, export, compare, print.
-
-        Raises:
-            InputError: there are no steps to train.
-        """
-        if self.steps < 1:
-            raise InputError(f"--steps must be at least 1, got {self.steps}")
+        """Train, export, compare, print."""
         from ssa_nerfstudio.experiments.demo.comparison import ARTIFACTS, SMALL_SCENE
         from ssa_nerfstudio.experiments.runs.run_configuration import configure
         from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate

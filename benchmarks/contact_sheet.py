@@ -10,7 +10,7 @@ import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from ssa_nerfstudio.cli import run_script
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
@@ -55,17 +55,11 @@ def contact_sheet(scene: DemoScene, seed: int = 0) -> Image.Image:
 class Command:
     """Draw all effects on the built-in scene as one picture."""
 
-    file: Annotated[Path, tyro.conf.Positional]
+    file: Annotated[Path, tyro.conf.Positional, file_to_write(".png")]
     """PNG file to write, in a folder that exists."""
 
     def run(self) -> None:
-        """Write the contact sheet.
-
-        Raises:
-            InputError: the file is no .png, or its folder does not exist.
-        """
-        if self.file.suffix != ".png" or not self.file.parent.is_dir():
-            raise InputError(f"{self.file} cannot be written", "name a .png file in a folder that exists")
+        """Write the contact sheet."""
         sheet = contact_sheet(DemoScene(views=2, test_views=1, width=_FRAME[0], height=_FRAME[1]))
         sheet.save(self.file, optimize=True)
 

@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import NotNegative
 from ssa_nerfstudio.errors import InputError
 
 COUNTS = ("num_statements", "covered_lines", "num_branches", "covered_branches")
@@ -23,7 +24,7 @@ class Command:
 
     report: Annotated[Path, tyro.conf.Positional]
     """Written by `pytest --cov ssa_nerfstudio --cov-branch --cov-report json:FILE`."""
-    files: int = 12
+    files: NotNegative = 12
     """How many files to list."""
 
     def run(self) -> None:

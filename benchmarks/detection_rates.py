@@ -18,6 +18,7 @@ from rich.progress import track
 
 from ssa_nerfstudio.cameras.lens import undistort
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, NotNegative
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import Detection, detect
@@ -105,12 +106,12 @@ class Command:
     """Clean nerfstudio datasets."""
     effects: tuple[str, ...] = ("none", "watermark", "ui", "dashboard", "rain", "mud")
     """Effects, each alone; none for the photos as they are."""
-    views: tuple[int, ...] = (12, 25, 50)
+    views: tuple[NotNegative, ...] = (12, 25, 50)
     """Numbers of views; 0 for all, unless contiguous."""
     contiguous: bool = False
     """Take neighboring views, from the beginning, the middle and the end, instead of evenly spread ones."""
-    seeds: int = 5
-    """Seeds of each effect and of detection's shifts, at least 1."""
+    seeds: Count = 5
+    """Seeds of each effect and of detection's shifts."""
     rate: bool = False
     """Measure the time of detection instead, beside that of decoding and undistorting."""
 
@@ -120,8 +121,9 @@ class Command:
         Raises:
             InputError: a number is too small, or a dataset or an effect cannot be used.
         """
-        if self.seeds < 1 or min(self.views) < 0:
-            raise InputError("--seeds must be at least 1 and --views not negative")
+        if self.contiguous and 0 in self.views:
+            raise InputError("--views 0 is all views, of which --contiguous has no parts", "leave one of them out")
+        read_effects(tuple(effect for effect in self.effects if effect != "none"))
         for row in self._rate_rows() if self.rate else self._rows():
             print(row, flush=True)
 

@@ -17,8 +17,10 @@ import numpy as np
 import torch
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, Factor
+from ssa_nerfstudio.data.training_requirements import check_training
 from ssa_nerfstudio.data.transforms import Transforms
-from ssa_nerfstudio.errors import InputError, TrainingError
+from ssa_nerfstudio.errors import TrainingError
 from ssa_nerfstudio.experiments.runs.machine import versions
 
 ALIVE = 0.005
@@ -38,24 +40,22 @@ class Command:
     """Overlays to train with; several processes, one a GPU, can share the four trainings and the folder."""
     guards: tuple[bool, ...] = (False, True)
     """Whether to train with guards."""
-    steps: int = 15_000
+    steps: Count = 15_000
     """Training steps of each run; schedules are scaled to them."""
-    cap_max: int = 300_000
+    cap_max: Count = 300_000
     """The largest number of Gaussians."""
-    scale_factor: float = 1.0
+    scale_factor: Factor = 1.0
     """Photos are resized by this."""
-    every: int = 10
+    every: Count = 10
     """Steps between two recorded values."""
 
     def run(self) -> None:
         """Train, write, draw.
 
         Raises:
-            InputError: an option is out of range, or the dataset cannot be trained on.
+            InputError: the dataset cannot be trained on.
         """
-        if self.every < 1:
-            raise InputError(f"--every must be at least 1, got {self.every}")
-        Transforms.read(self.data)
+        check_training(Transforms.read(self.data))
         self.output.mkdir(parents=True, exist_ok=True)
         for overlay, guards in itertools.product(self.overlay, self.guards):
             run = self._train(overlay, guards)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from ssa_nerfstudio.cli import run_script
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.export.splats import properties, select, write_compressed_ply, write_ply
 
 
@@ -24,17 +24,11 @@ class Command:
 
     output: Path
     """Folder for the three files."""
-    gaussians: int = 1_000_000
-    """Number of Gaussians, at least 1, each of 62 values (third-degree spherical harmonics)."""
+    gaussians: Count = 1_000_000
+    """Number of Gaussians, each of 62 values (third-degree spherical harmonics)."""
 
     def run(self) -> None:
-        """Measure and print.
-
-        Raises:
-            InputError: there are no Gaussians to write.
-        """
-        if self.gaussians < 1:
-            raise InputError(f"--gaussians must be at least 1, got {self.gaussians}")
+        """Measure and print."""
         from nerfstudio.scripts.exporter import ExportGaussianSplat
 
         self.output.mkdir(parents=True, exist_ok=True)

@@ -10,12 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import torch
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Factor, Method, NotNegative, at_least
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
@@ -33,17 +34,17 @@ class Command:
 
     data: Path
     """A nerfstudio dataset."""
-    method: str = "ssa-splatfacto"
-    """One of this plugin's methods."""
-    overlay: str = "on"
-    """on or off."""
-    grow: int = 2_000
+    method: Method = "ssa-splatfacto"
+    """Method to train with."""
+    overlay: Literal["on", "off"] = "on"
+    """Whether the method learns an overlay."""
+    grow: NotNegative = 2_000
     """Steps of ordinary training before the first block."""
-    pairs: int = 100
+    pairs: Annotated[int, at_least(4)] = 100
     """So many times as many steps as lie between two checks by the host; the first two warm up."""
     block: int = 10
     """Steps before the other takes its turn."""
-    scale_factor: float = 1.0
+    scale_factor: Factor = 1.0
     """Photos are resized by this."""
 
     def run(self) -> None:
@@ -52,8 +53,8 @@ class Command:
         Raises:
             InputError: an option is out of range, or the dataset cannot be trained on.
         """
-        if self.block < 1 or CHECK_EVERY % self.block or self.pairs < 4:
-            raise InputError(f"--block must divide {CHECK_EVERY} and --pairs be at least 4")
+        if self.block < 1 or CHECK_EVERY % self.block:
+            raise InputError(f"--block must divide {CHECK_EVERY}, got {self.block}")
         Transforms.read(self.data)
         from ssa_nerfstudio.plugin.training.event_writers import no_event_writers_left
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 
@@ -57,17 +58,15 @@ class Command:
 
     data: Path
     """A nerfstudio dataset."""
-    rounds: int = 3
+    rounds: Count = 3
     """Processes."""
 
     def run(self) -> None:
         """Print a row for each part: its seconds in every round, and their median.
 
         Raises:
-            InputError: an option is out of range, the dataset cannot be trained on, or a start failed.
+            InputError: the dataset cannot be trained on, or a start failed.
         """
-        if self.rounds < 1:
-            raise InputError(f"--rounds must be at least 1, got {self.rounds}")
         Transforms.read(self.data)
         found = [_parts(self.data) for _ in range(self.rounds)]
         print("| part | seconds | median |\n|---|---|---|")

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.progress import track
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.photos import read_photo
-from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
@@ -84,8 +84,8 @@ class Command:
     """Clean nerfstudio datasets, or ones with clean counterparts of all photos in clean/."""
     effects: tuple[str, ...] = (RECORDED, "watermark", "ui", "dashboard", "rain", "mud")
     """Effects, each alone; recorded: the capture's own, where it has clean counterparts."""
-    seeds: int = 3
-    """Seeds of each effect and of the shifts, at least 1."""
+    seeds: Count = 3
+    """Seeds of each effect and of the shifts."""
     rate: bool = False
     """Measure the time of the scan instead."""
 
@@ -93,10 +93,9 @@ class Command:
         """Print a Markdown table row by row.
 
         Raises:
-            InputError: there are no seeds, or a dataset or an effect cannot be used.
+            InputError: a dataset or an effect cannot be used.
         """
-        if self.seeds < 1:
-            raise InputError(f"--seeds must be at least 1, got {self.seeds}")
+        read_effects(tuple(effect for effect in self.effects if effect != RECORDED))
         for row in self._rate_rows() if self.rate else self._rows():
             print(row, flush=True)
 

@@ -6,23 +6,35 @@ import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, at_least
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.effects.catalogue import effect_class
 from ssa_nerfstudio.experiments.effects.layers import Layers
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
+from ssa_nerfstudio.experiments.simulation.scene import read_effects
 
 
-def write_scene(folder: Path, effect: str, views: int, width: int, height: int) -> None:
-    """Write the built-in scene with an effect in front of the second half of its training photos."""
-    DemoScene(views=views, width=width, height=height).write(folder, None)
-    layers = effect_class(effect)().layers(height, width, np.random.default_rng(0))
+def layers_of(effect: str, width: int, height: int) -> Layers:
+    """Draw an effect.
+
+    Raises:
+        InputError: there is no such effect, or it varies from view to view.
+    """
+    ((_, parameters),) = read_effects((effect,))
+    layers = parameters.layers(height, width, np.random.default_rng(0))
     if not isinstance(layers, Layers):
-        raise InputError(f"{effect} varies from view to view", "choose another effect")
+        raise InputError(f"--effects: {effect} varies from view to view", "choose another effect")
+    return layers
+
+
+def write_scene(folder: Path, layers: Layers, views: int, width: int, height: int) -> None:
+    """Write the built-in scene with an artifact in front of the second half of its training photos."""
+    DemoScene(views=views, width=width, height=height).write(folder, None)
     for name in sorted(json.loads((folder / "transforms.json").read_text())["train_filenames"])[views // 2 :]:
         photo = np.asarray(Image.open(folder / name), np.float32) / 255
         behind = (layers.transmittance * photo + layers.addition).clip(0, 1)
@@ -35,19 +47,24 @@ class Command:
 
     effects: tuple[str, ...] = ("dashboard", "ui")
     """Effects, each alone, in front of the second half of the photos."""
-    views: int = 40
+    views: Annotated[int, at_least(2)] = 40
     """Training photos."""
-    width: int = 96
-    height: int = 72
-    steps: int = 600
+    width: Count = 96
+    height: Count = 72
+    steps: Count = 600
     """Of each training."""
 
     def run(self) -> None:
-        """Print a Markdown table row by row."""
+        """Print a Markdown table row by row.
+
+        Raises:
+            InputError: an effect cannot be used.
+        """
+        drawn = {effect: layers_of(effect, self.width, self.height) for effect in self.effects}
         print("| effect in the second half | overlay-intervals off, dB | auto, dB |\n|---|---|---|")
-        for effect in self.effects:
+        for effect, layers in drawn.items():
             with tempfile.TemporaryDirectory() as folder:
-                write_scene(Path(folder) / "scene", effect, self.views, self.width, self.height)
+                write_scene(Path(folder) / "scene", layers, self.views, self.width, self.height)
                 values = [self._psnr(Path(folder), setting) for setting in ("off", "auto")]
             print(f"| {effect} | " + " | ".join(f"{value:.2f}" for value in values) + " |", flush=True)
 

@@ -14,6 +14,7 @@ from typing import Annotated
 import tyro
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
 
@@ -31,17 +32,15 @@ class Command:
 
     results: Annotated[Path, tyro.conf.Positional]
     """Folder of a benchmark's results."""
-    output: Path
+    output: Annotated[Path, file_to_write(".png", ".svg")]
     """Picture to write, .png or .svg."""
 
     def run(self) -> None:
         """Write the picture and print Markdown.
 
         Raises:
-            InputError: the folder has no finished run at several lengths, or no bar, or the picture cannot be written.
+            InputError: the folder has no finished run at several lengths, or no bar.
         """
-        if self.output.suffix not in (".png", ".svg"):
-            raise InputError(f"{self.output} is no name of a picture", "end it with .png or .svg")
         found = [result for result in read_all([self.results])[0] if result.status == "finished"]
         bars = {result.run.scene: result.metrics["psnr"] for result in found if _is_bar(result)}
         runs = [result for result in found if _is_of_a_curve(result)]

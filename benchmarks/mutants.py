@@ -6,11 +6,13 @@ import random
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from mutation.changed_folder import KNOWN, NOTICED, ChangedFolder
 
 from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, NotNegative, at_least
 from ssa_nerfstudio.errors import InputError
 
 ROOT = Path(__file__).parents[1]
@@ -26,13 +28,13 @@ class Command:
     """Folder below ssa_nerfstudio, and below tests: overlay, evidence, plugin/training, ...; or all of them: all."""
     output: Path = Path("build/mutants")
     """Folder to work in. A stopped run continues; survivors and mutants of changed functions are tried anew."""
-    children: int = field(default_factory=usable_cores)
+    children: Count = field(default_factory=usable_cores)
     """Mutants tried at once."""
-    sample: int = 0
+    sample: NotNegative = 0
     """Try so many, drawn at random from all changes that are asked for; 0: all."""
     seed: int = 0
     """Of the sample."""
-    budget: float = 60
+    budget: Annotated[float, at_least(1)] = 60
     """Seconds of tests for each change, those of the quickest files first."""
     named: bool = False
     """Use all tests of files that name the changed module, and do not measure which reach the change: quicker for a
@@ -42,11 +44,8 @@ class Command:
         """Try what is left, and write OUTPUT/ROOM.md.
 
         Raises:
-            InputError: there is no such folder, or a number cannot be used.
+            InputError: there is no such folder.
         """
-        for name, lowest in (("sample", 0), ("children", 1), ("budget", 1)):
-            if not getattr(self, name) >= lowest:
-                raise InputError(f"--{name} must be at least {lowest}, got {getattr(self, name)}")
         rooms = [ChangedFolder(name, self.output.resolve() / name) for name in self._names()]
         before = {room: room.prepared() for room in rooms}
         every = [(room, change) for room in rooms for change in sorted(before[room])]

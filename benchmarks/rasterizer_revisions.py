@@ -21,6 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.rasterization import rasterizer
 
@@ -63,21 +64,19 @@ class Command:
 
     before: Path
     """The other checkout, such as a git worktree."""
-    repeats: int = 15
+    repeats: Count = 15
     """Rounds, of which the median counts."""
-    threads: int = 1
+    threads: Count = 1
     """Threads of the kernels and of torch."""
 
     def run(self) -> None:
         """Print a table.
 
         Raises:
-            InputError: `before` is no checkout, or a number is below 1.
+            InputError: `before` is no checkout.
         """
         if not (self.before / "ssa_nerfstudio" / "rasterization" / "cpu.py").is_file():
             raise InputError(f"{self.before} is no checkout of this repository", "give the folder of a git worktree")
-        if min(self.repeats, self.threads) < 1:
-            raise InputError("--repeats and --threads must be at least 1")
         torch.set_num_threads(self.threads)
         both = {"before": rasterization_of(self.before.resolve()), "now": rasterizer("cpu", "cpu")}
         table = Table(title=f"ms of CPU time, median of {self.repeats}, {self.threads} threads")

@@ -10,11 +10,11 @@ from __future__ import annotations
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import torch.nn.functional as F
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, Factor, Method
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.metrics.artifact_region import ArtifactRegion
@@ -30,11 +30,11 @@ class Command:
 
     data: Path
     """A nerfstudio dataset with artifact_mask_approx.png."""
-    method: Literal["ssa-splatfacto", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"] = "ssa-splatfacto"
+    method: Method = "ssa-splatfacto"
     """Method to train with."""
-    steps: int = 30_000
+    steps: Count = 30_000
     """Training steps; every schedule is scaled to them."""
-    scale_factor: float = 1.0
+    scale_factor: Factor = 1.0
     """Photos are resized by this."""
     settings: tuple[str, ...] = ()
     """Settings of the model as name=value, for example overlay_start=statistics."""

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, NotNegative, file_to_write
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import METHODS, title
@@ -50,15 +51,15 @@ class Command:
 
     folder: Annotated[Path, tyro.conf.Positional]
     """Output folder of `ssa bench`, with its pictures/."""
-    output: Path
-    """Picture to write."""
+    output: Annotated[Path, file_to_write(".jpg", ".png")]
+    """Picture to write, .jpg or .png."""
     scene: str
     """Capture; SOURCES.md of the captures says which renders may be shown."""
     effects: tuple[str, ...]
     """One row or more each."""
-    densification: str = "adc"
-    seed: int = 0
-    width: int = 300
+    densification: Literal["adc", "mcmc"] = "adc"
+    seed: NotNegative = 0
+    width: Count = 300
     """Of a render, pixels."""
 
     def run(self) -> None:

@@ -17,7 +17,7 @@ from PIL import Image
 from viewer_screenshots import browser
 
 from ssa_nerfstudio.cli import main, run_script
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.cli.option_bounds import Count, file_to_write
 from ssa_nerfstudio.experiments.effects.dashboard import Dashboard
 from ssa_nerfstudio.experiments.simulation.built_in_scene import DemoScene
 
@@ -30,21 +30,19 @@ _SMALL = ["--train.pipeline.model.num-downscales", "0", "--train.pipeline.model.
 class Command:
     """Take the documentation's picture of a run's report."""
 
-    output: Annotated[Path, tyro.conf.Positional]
+    output: Annotated[Path, tyro.conf.Positional, file_to_write(".png")]
     """The .png file to write."""
-    views: int = 36
+    views: Count = 36
     """Number of photos."""
-    steps: int = 400
+    steps: Count = 400
     """Training steps."""
 
     def run(self) -> None:
         """Render the photos, run all stages, and take the picture.
 
         Raises:
-            InputError: there is no such folder, or no Chromium.
+            InputError: there is no Chromium.
         """
-        if self.output.suffix != ".png" or not self.output.parent.is_dir():
-            raise InputError(f"{self.output} cannot be written", "name a .png file in a folder that exists")
         with tempfile.TemporaryDirectory() as scratch, browser() as chromium:
             photos, out = Path(scratch) / "drive", Path(scratch) / "out"
             _write_photos(photos, self.views)

@@ -11,18 +11,24 @@ import json
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 from sfm_accuracy import center_errors
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, at_least
 from ssa_nerfstudio.data.sources import read_sources
+from ssa_nerfstudio.data.transforms import Transforms
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.sfm.photos_to_dataset import process
 from ssa_nerfstudio.sfm.reconstruction import SfmSettings
 
 CAMERAS = {"front": (480, 270), "side": (400, 300)}
 """Width and height of the crops."""
+MIN_PHOTOS = 3
+"""Of each camera."""
 
 
 @dataclass
@@ -31,23 +37,27 @@ class Command:
 
     data: tuple[Path, ...]
     """Datasets with true poses."""
-    photos: int = 40
+    photos: Annotated[int, at_least(2 * MIN_PHOTOS)] = 40
     """Number of photos, the first in order."""
-    width: int = 640
+    width: Annotated[int, at_least(max(width for width, _ in CAMERAS.values()))] = 640
     """Photos are reduced to it before they are cropped, pixels."""
     off_center: int = 0
     """How far the side camera's crop is right of the center, pixels; no camera is like this, but a user's crop may."""
-    threads: int = 1
-    """Threads, at least 1."""
+    threads: Count = 1
+    """Threads."""
 
     def run(self) -> None:
         """Measure, and print a line for each dataset and way.
 
         Raises:
-            InputError: a dataset cannot be used, or too few photos register.
+            InputError: a dataset cannot be used, crops do not fit into its photos, or too few photos register.
         """
-        for data in self.data:
-            meta = json.loads((data / "transforms.json").read_text())
+        if abs(self.off_center) > (most := (self.width - CAMERAS["side"][0]) // 2):
+            raise InputError(
+                f"--off-center must be from -{most} to {most} at --width {self.width}, got {self.off_center}"
+            )
+        metas = {data: self._meta(data) for data in self.data}
+        for data, meta in metas.items():
             frames = sorted(meta["frames"], key=lambda frame: frame["file_path"])[: self.photos]
             true = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
             with tempfile.TemporaryDirectory() as scratch:
@@ -57,11 +67,20 @@ class Command:
                 for detect in (False, True):
                     output = Path(scratch) / f"dataset_{detect}"
                     settings = SfmSettings(threads=self.threads)
-                    found = process(read_sources(rig, "frame", 3), output, detect=detect, settings=settings)
+                    found = process(read_sources(rig, "frame", MIN_PHOTOS), output, detect=detect, settings=settings)
                     row = {"data": data.name, "detect": detect, "masked": round(found.masked, 3)}
                     scale = self.width / meta["w"]
                     row["true lens"] = [round(scale * meta[key]) for key in ("fl_x", "fl_y")]
                     print(json.dumps(row | compared(output, true)), flush=True)
+
+    def _meta(self, data: Path) -> dict[str, Any]:
+        meta, tallest = Transforms.read(data).meta, max(height for _, height in CAMERAS.values())
+        if not {"w", "h", "fl_x", "fl_y"} <= meta.keys():
+            raise InputError(f"{data} does not state one lens for all photos", "choose a dataset of one camera")
+        if (height := round(self.width * meta["h"] / meta["w"])) < tallest:
+            problem = f"--width {self.width} makes photos of {data} {height} pixels high"
+            raise InputError(problem, f"choose a larger one: crops are {tallest} high")
+        return meta
 
     def _write(self, photo: Path, rig: Path, number: int) -> None:
         camera = "side" if number % 2 else "front"

@@ -12,11 +12,12 @@ import os
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count, file_to_write
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.errors import InputError
@@ -111,28 +112,27 @@ class Command:
 
     data: tuple[Path, ...]
     """Datasets with true poses."""
-    output: Path
+    output: Annotated[Path, file_to_write()]
     """File of JSON lines to append to, one for each run; runs that it has are not repeated."""
     effects: tuple[str, ...] = ("none", "dashboard", "ui", "mud")
     """Artifacts; none for clean photos."""
     ways: tuple[Literal["COLMAP", "detection", "mask", "default", "default and detection"], ...] = tuple(WAYS)
     """Countermeasures; COLMAP for none."""
-    photos: int = 40
+    photos: Count = 40
     """Largest number of training photos, the first in order."""
-    max_image_size: int = 1600
+    max_image_size: Count = 1600
     """Longest side of the photos for feature extraction, pixels."""
-    threads: int = 1
-    """Threads, at least 1."""
+    threads: Count = 1
+    """Threads."""
 
     def run(self) -> None:
         """Measure, and print the rows.
 
         Raises:
-            InputError: a number is below 1, or a dataset or an effect cannot be used.
+            InputError: a dataset or an effect cannot be used, or `output` holds something else.
         """
-        if min(self.photos, self.max_image_size, self.threads) < 1:
-            raise InputError("--photos, --max-image-size and --threads must be at least 1")
-        done = [json.loads(line) for line in self.output.read_text().splitlines()] if self.output.exists() else []
+        read_effects(tuple(effect for effect in self.effects if effect != "none"))
+        done = _earlier(self.output) if self.output.exists() else []
         for data in self.data:
             for effect in self.effects:
                 ways = [way for way in self.ways if effect != "none" or way in ("COLMAP", "default")]
@@ -160,6 +160,15 @@ class Command:
                 print(result, flush=True)
                 with self.output.open("a") as file:
                     file.write(result + "\n")
+
+
+def _earlier(path: Path) -> list[dict[str, object]]:
+    """Results of earlier calls."""
+    try:
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [line for line in lines if (line["data"], line["artifact"], line["way"])]
+    except (ValueError, TypeError, LookupError) as error:
+        raise InputError(f"{path} holds no results of this script ({error})", "choose another --output") from error
 
 
 def _open_part(layers: Path) -> np.ndarray:

@@ -17,9 +17,9 @@ from rich.console import Console
 from rich.table import Table
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.data.dataset import Dataset, View
 from ssa_nerfstudio.data.photos import write_photo
-from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.effects.catalogue import EFFECTS
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
@@ -72,19 +72,18 @@ class Command:
     """Dataset to read."""
     effects: tuple[str, ...] = tuple(EFFECTS)
     """Effects to time, each alone."""
-    threads: int = 2
-    """Photos in flight at once, at least 1."""
-    repeats: int = 3
-    """Turns, at least 1, of which the median counts."""
+    threads: Count = 2
+    """Photos in flight at once."""
+    repeats: Count = 3
+    """Turns, of which the median counts."""
 
     def run(self) -> None:
         """Print a row for each effect.
 
         Raises:
-            InputError: a number is below 1, or the dataset or an effect cannot be used.
+            InputError: the dataset or an effect cannot be used.
         """
-        if min(self.threads, self.repeats) < 1:
-            raise InputError("--threads and --repeats must be at least 1")
+        read_effects(self.effects)
         dataset = Dataset.read(self.data, eval_interval=8)
         count = len(dataset.split[0])
         height, width = dataset.views[0].size

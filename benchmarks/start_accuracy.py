@@ -13,13 +13,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
 
 from ssa_nerfstudio import evidence
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
@@ -72,7 +73,7 @@ class Command:
     """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
     """Also halve and double each constant."""
-    output: Path | None = None
+    output: Annotated[Path, file_to_write()] | None = None
     """File to which every result is added, as a line of JSON. What it has is not measured again."""
 
     def run(self) -> None:

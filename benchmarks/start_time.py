@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 
@@ -52,20 +53,21 @@ class Command:
     """A nerfstudio dataset."""
     methods: tuple[str, ...] = ("splatfacto", "ssa-splatfacto")
     """Methods to start, in turn."""
-    rounds: int = 4
+    rounds: Count = 4
     """Starts of each; the first is not counted."""
 
     def run(self) -> None:
         """Print each start, then a line for each method: its seconds, their median, and its ratio to the first.
 
         Raises:
-            InputError: an option is out of range, the dataset cannot be trained on, or a start failed.
+            InputError: there is no such method, the dataset cannot be trained on, or a start failed.
         """
-        if self.rounds < 1:
-            raise InputError(f"--rounds must be at least 1, got {self.rounds}")
-        if not self.methods:
-            raise InputError("no method is given", "leave --methods out, or name some")
         Transforms.read(self.data)
+        from nerfstudio.configs.method_configs import all_methods
+
+        for method in self.methods:
+            if method not in all_methods:
+                raise InputError(f"--methods: there is no method {method!r}", f"choose among {', '.join(all_methods)}")
         seconds: dict[str, list[float]] = {method: [] for method in self.methods}
         for _ in range(self.rounds):
             for method in self.methods:

@@ -17,13 +17,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 from gsplat.strategy import ops
 from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Factor, NotNegative, file_to_write
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 
@@ -54,14 +55,14 @@ class Command:
     overlay: Literal["on", "off"] = "on"
     """Whether the method learns an overlay; splatfacto has none."""
 
-    gaussians: int = 0
+    gaussians: NotNegative = 0
     """Split the Gaussians after 610 steps, as densification does, until there are at least so many; then no more."""
-    enlarge: float = 1.0
+    enlarge: Factor = 1.0
     """Enlarge the photos by this: the work of a capture with more pixels, not its details."""
 
     alternate: bool = False
     """Take turns of 100 steps, four without CUDA graphs (SSA_CUDA_GRAPHS=0), four with, and print a line for each."""
-    profile: Path | None = None
+    profile: Annotated[Path, file_to_write()] | None = None
     """Write a table of torch's profiler to this file, and end after the steps that are in it."""
 
     def run(self) -> None:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from ssa_nerfstudio.cli import run_script
+from ssa_nerfstudio.cli.option_bounds import Bound, Count, Factor, Method
+from ssa_nerfstudio.data.training_requirements import check_training
 from ssa_nerfstudio.data.transforms import Transforms
 
 
@@ -16,15 +19,17 @@ class Command:
 
     data: Path
     """A nerfstudio dataset."""
-    output: Path
+    output: Annotated[
+        Path, Bound("a .json file that is no folder", lambda path: path.suffix == ".json" and not path.is_dir())
+    ]
     """The JSON file to write; the trained model goes into a folder beside it."""
-    method: str = "ssa-splatfacto"
-    """ssa-splatfacto, or with -fast, -mcmc or -paper behind it."""
-    steps: int = 30_000
+    method: Method = "ssa-splatfacto"
+    """Method to train with."""
+    steps: Count = 30_000
     """Training steps; every schedule is scaled to them."""
     settings: tuple[str, ...] = ()
     """Settings of the model as name=value, for example overlay=off sparsity_weight=0.01."""
-    scale_factor: float = 1.0
+    scale_factor: Factor = 1.0
     """Photos are resized by this."""
 
     def run(self) -> None:
@@ -33,7 +38,7 @@ class Command:
         Raises:
             InputError: the model has no such setting, or the dataset cannot be trained on.
         """
-        Transforms.read(self.data)
+        check_training(Transforms.read(self.data))
         from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
         from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 

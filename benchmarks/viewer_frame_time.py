@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from ssa_nerfstudio.cli import run_script
-from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.experiments.benchmark.report.bootstrap import percent_change
 from ssa_nerfstudio.experiments.runs.machine import versions
 
@@ -30,23 +30,21 @@ class Command:
 
     data: Path
     """A nerfstudio dataset."""
-    steps: int = 100
+    steps: Count = 100
     """Training steps before the measurement; the number of Gaussians decides what a frame costs."""
-    frames: int = 200
-    """Frames of each kind, at least 1; a tenth as many warm up."""
-    width: int = 1024
+    frames: Count = 200
+    """Frames of each kind; a tenth as many warm up."""
+    width: Count = 1024
     """Width of the viewport, pixels."""
-    height: int = 576
+    height: Count = 576
     """Height of the viewport, pixels."""
 
     def run(self) -> None:
         """Train, draw in turns, and print a line for each kind.
 
         Raises:
-            InputError: there are no frames to draw, or the dataset cannot be trained on.
+            InputError: the dataset cannot be trained on.
         """
-        if min(self.frames, self.width, self.height) < 1:
-            raise InputError("--frames, --width and --height must be at least 1")
         from ssa_nerfstudio.experiments.runs.run_configuration import configure
         from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
 

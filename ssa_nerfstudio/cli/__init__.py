@@ -57,15 +57,18 @@ def run_script(command: type) -> None:
     """Run a script that is no command of `ssa` as if it were one: the same options, errors and exit codes.
 
     Args:
-        command: a dataclass with a method `run`; its docstring is the first line of --help.
+        command: a dataclass with a method `run`; its docstring is the first line of --help, and the types of its fields
+            may state bounds (`option_bounds`).
     """
     import inspect
 
-    from ssa_nerfstudio.cli import arguments
+    from ssa_nerfstudio.cli import arguments, option_bounds
 
     program = f"python {sys.argv[0]}"
     with termination.as_ctrl_c(), _errors_in_one_line(program):
-        arguments.read(command, sys.argv[1:], program, inspect.getdoc(command) or "").run()
+        read = arguments.read(command, sys.argv[1:], program, inspect.getdoc(command) or "")
+        option_bounds.check(read)
+        read.run()
 
 
 @contextmanager
