@@ -116,6 +116,8 @@ REFUSED = [
     ("train --data x --output folder.json", "--output must be a .json file that is no folder, got folder.json"),
     ("train --data x --output r.json --method foo", "invalid choice 'foo' for argument '--method'"),
     ("train --data torn --output r.json", "transforms.json lists 1 photo"),
+    ("train --data scene --output r.json --settings x", "--settings x: there is no =; give name=value"),
+    ("train --data scene --output r.json --settings sparsity_weight=[1", "--settings sparsity_weight=[1: the value is"),
     ("interval_training --effects foo", "effects has no 'foo'; choose one of dashboard"),
     ("interval_training --effects dashboard finger", "--effects: finger varies from view to view"),
     ("interval_training --views 0", "--views must be at least 2, got 0"),

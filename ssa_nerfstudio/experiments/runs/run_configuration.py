@@ -68,12 +68,24 @@ def configure(
 
 
 def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
-    """Settings of the model by field name, from name=value."""
+    """Settings of the model by field name, from name=value.
+
+    Raises:
+        InputError: one lacks the =, or its value is no YAML.
+    """
     usual, model = SSASplatfactoModelConfig(), {}
-    for name, value in (setting.split("=", 1) for setting in settings):
-        model[name] = yaml.safe_load(value)
+    for setting in settings:
+        name, equals, value = setting.partition("=")
+        if not equals:
+            raise InputError(f"--settings {setting}: there is no =", "give name=value, for example overlay=off")
+        try:
+            model[name] = yaml.safe_load(value)
+        except (yaml.YAMLError, ValueError) as error:  # the latter of dates such as 2026-02-30
+            raise InputError(
+                f"--settings {setting}: the value is no valid YAML ({error})", "put it in quotes"
+            ) from error
         if isinstance(model[name], bool) and isinstance(getattr(usual, name, None), str):
             model[name] = value.lower()  # YAML reads on and off as booleans
     if "overlay_given" in model:
-        model["overlay_given"] = Path(model["overlay_given"])
+        model["overlay_given"] = Path(str(model["overlay_given"]))
     return model
