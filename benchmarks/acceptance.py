@@ -17,7 +17,7 @@ import tyro
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.study import MAX_LOSS, Study, finite, lead, mean, studies
-from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
+from ssa_nerfstudio.experiments.benchmark.results import Result, read_named
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import CLEAN
 
 
@@ -106,7 +106,7 @@ class Command:
         Raises:
             InputError: there are no results to judge.
         """
-        results, _ = read_all([*self.folders])
+        results, _ = read_named(self.folders)
         missed = judged = 0
         for study in studies(results):
             for densification in study.densifications:

@@ -16,7 +16,7 @@ import tyro
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
+from ssa_nerfstudio.experiments.benchmark.results import Result, read_named
 
 STYLES = {"adc": "-o", "mcmc": "--s"}
 BAR = "none", "3dgs"
@@ -41,7 +41,7 @@ class Command:
         Raises:
             InputError: the folder has no finished run at several lengths, or no bar.
         """
-        found = [result for result in read_all([self.results])[0] if result.status == "finished"]
+        found = [result for result in read_named([self.results])[0] if result.status == "finished"]
         bars = {result.run.scene: result.metrics["psnr"] for result in found if _is_bar(result)}
         runs = [result for result in found if _is_of_a_curve(result)]
         missing = sorted({result.run.scene for result in runs} - bars.keys())

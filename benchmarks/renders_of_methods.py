@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.option_bounds import Count, NotNegative, file_to_write
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
+from ssa_nerfstudio.experiments.benchmark.results import Result, read_named
 from ssa_nerfstudio.experiments.benchmark.specification.method_matrix import METHODS, title
 
 _COLUMNS = 4
@@ -68,7 +68,7 @@ class Command:
         Raises:
             InputError: no run of an effect has pictures.
         """
-        results, _ = read_all([self.folder])
+        results, _ = read_named([self.folder])
         rows = [self._row(results, effect) for effect in self.effects]
         sheet(rows, self.width).save(self.output, quality=85)
 

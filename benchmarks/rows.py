@@ -18,7 +18,7 @@ import tyro
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.report.study import MAX_LOSS, Study, lead, mean, studies
-from ssa_nerfstudio.experiments.benchmark.results import Result, read_all
+from ssa_nerfstudio.experiments.benchmark.results import Result, read_named
 
 
 def cells(study: Study, effect: str, scene: str, densification: str) -> list[str]:
@@ -121,7 +121,7 @@ class Command:
         Raises:
             InputError: there are no results, or none of a method.
         """
-        results, _ = read_all([*self.folders])
+        results, _ = read_named(self.folders)
         compared = [study for study in studies(results) if study.clean_tests]
         if not compared:
             raise InputError("no results with clean test photos", "name the --output of ssa bench captures")

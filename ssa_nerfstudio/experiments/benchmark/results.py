@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -138,6 +139,21 @@ def read_all(folders: list[Path]) -> tuple[list[Result], list[str]]:
             if result.run.id not in found or found[result.run.id].status == "failed":
                 found[result.run.id] = result
     return list(found.values()), problems
+
+
+def read_named(folders: Sequence[Path]) -> tuple[list[Result], list[str]]:
+    """`read_all` of folders that a user names.
+
+    Raises:
+        InputError: none is named, or one does not exist or is none of `ssa bench`.
+    """
+    if not folders:
+        raise InputError("no folder of results is named", "name the --output folder of ssa bench")
+    for folder in folders:
+        if not (folder / "results").is_dir():
+            missing = "" if folder.exists() else ": it does not exist"
+            raise InputError(f"{folder} holds no results{missing}", "choose the output folder of ssa bench")
+    return read_all([*folders])
 
 
 def absence(results: list[Result], planned: set[str]) -> str:

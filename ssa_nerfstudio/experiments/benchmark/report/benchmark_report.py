@@ -22,7 +22,7 @@ from ssa_nerfstudio.experiments.benchmark.report.document import Document, Pictu
 from ssa_nerfstudio.experiments.benchmark.report.latex import write_latex
 from ssa_nerfstudio.experiments.benchmark.report.picture_sheets import sheet
 from ssa_nerfstudio.experiments.benchmark.report.study import Study, studies
-from ssa_nerfstudio.experiments.benchmark.results import Result, absence, read_all
+from ssa_nerfstudio.experiments.benchmark.results import Result, absence, read_named
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark
 from ssa_nerfstudio.experiments.benchmark.specification.plan import Run
 
@@ -51,10 +51,7 @@ def report(folders: list[Path], output: Path) -> tuple[list[Path], list[str]]:
     Raises:
         InputError: there is no result at all.
     """
-    for folder in folders:
-        if not (folder / "results").is_dir():
-            raise InputError(f"{folder} holds no results", "choose the output folder of ssa bench")
-    results, problems = read_all(folders)
+    results, problems = read_named(folders)
     if not any(result.status != "failed" and not result.run.marks for result in results):
         raise InputError(f"{folders[0]}/results holds no result of ssa bench that ended", "run ssa bench first")
     planned, protocols = _plans(folders)
