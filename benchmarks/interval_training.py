@@ -50,7 +50,9 @@ class Command:
     views: Annotated[int, at_least(2)] = 40
     """Training photos."""
     width: Count = 96
+    """Of a photo, pixels."""
     height: Count = 72
+    """Of a photo, pixels."""
     steps: Count = 600
     """Of each training."""
 

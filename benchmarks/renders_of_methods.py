@@ -58,7 +58,9 @@ class Command:
     effects: tuple[str, ...]
     """One row or more each."""
     densification: Literal["adc", "mcmc"] = "adc"
+    """Of the runs to draw."""
     seed: NotNegative = 0
+    """Of the runs to draw."""
     width: Count = 300
     """Of a render, pixels."""
 

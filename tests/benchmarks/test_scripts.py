@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import json
 import os
 import re
@@ -192,6 +193,15 @@ def test_what_cannot_be_used_is_named_before_anything_is_measured(line, said, ca
     assert err.startswith("ssa-nerfstudio: error: ")
     assert err.count("\n") == 1
     assert sorted(tmp_path.rglob("*")) == there
+
+
+def test_every_option_is_explained():
+    for path in FOLDER.glob("*.py"):
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        for command in [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == "Command"]:
+            for field, text in zip(command.body, [*command.body[1:], None], strict=True):
+                if isinstance(field, ast.AnnAssign):
+                    assert isinstance(text, ast.Expr), f"{path.name}: {ast.unparse(field)}"
 
 
 @pytest.mark.slow
