@@ -150,6 +150,7 @@ class Command:
         with errors_for_run("detect"):
             detection = arguments.read(detect.Command, ["--data", str(self.photos), *detecting], "ssa detect", "")
             detection.check()
+        cameras = read_cameras(self.photos, detection.frames)
         work = None
         if is_dataset(self.photos):
             if processing:
@@ -169,7 +170,6 @@ class Command:
             for source in sources:
                 if source.faces:
                     console.print(typed_for_run(cut_into_faces(source), "process"), markup=False)
-        cameras = read_cameras(self.photos, detection.frames)
         steps, scale, warnings = choose_length_and_scale(longest, self.steps, METHODS[self.method].max_num_iterations)
         choices = Choices(self.photos, self.method, steps, scale, *self.forwarded)
         with errors_for_run("train"):
