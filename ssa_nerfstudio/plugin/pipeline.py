@@ -75,23 +75,12 @@ class SSAPipeline(VanillaPipeline):
     ) -> None:
         check_device(device)
         check_settings(config.model, device)
-        source = _source(config)
-        if test_mode != "val" and not source.exists():
-            raise InputError(
-                f"{source}, which the run was trained on, does not exist",
-                "put it there again" if source.is_absolute() else "call the command where the training was called",
-            )
-        if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
-            transforms, parser = Transforms.read(source), config.datamanager.dataparser
-            check_training(transforms, parser.downscale_factor, ("train", "val" if test_mode == "val" else "test"))
-            check_split_options(transforms, parser.eval_mode, parser.train_split_fraction, parser.eval_interval)
-            if test_mode == "val" and parser.load_3D_points:
-                check_seed_points(transforms)
+        check_data(config, test_mode)
         if test_mode == "val" and torch.device(device).type == "cuda":
             load_triton_meanwhile()
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
         self.sphere: SharedSphere | None = None
-        check_views(self.datamanager.train_dataparser_outputs, source)
+        check_views(self.datamanager.train_dataparser_outputs, _source(config))
         self.first_view = FirstView(lambda: self.datamanager.train_dataset.cameras)
         if test_mode == "val":
             cameras = self.datamanager.train_dataset.cameras
@@ -264,6 +253,26 @@ class SSAPipeline(VanillaPipeline):
         """The dataset's file; None where another parser than nerfstudio's reads it."""
         ours = isinstance(self.config.datamanager.dataparser, NerfstudioDataParserConfig)
         return Transforms.read(_source(self.config)) if ours else None
+
+
+def check_data(config: SSAPipelineConfig, test_mode: Literal["test", "val", "inference"] = "val") -> None:
+    """Check what a pipeline reads, without opening a photo; a training's is of mode val.
+
+    Raises:
+        InputError: it does not exist, or nerfstudio-data is to read it and cannot.
+    """
+    source = _source(config)
+    if test_mode != "val" and not source.exists():
+        raise InputError(
+            f"{source}, which the run was trained on, does not exist",
+            "put it there again" if source.is_absolute() else "call the command where the training was called",
+        )
+    if isinstance(config.datamanager.dataparser, NerfstudioDataParserConfig):
+        transforms, parser = Transforms.read(source), config.datamanager.dataparser
+        check_training(transforms, parser.downscale_factor, ("train", "val" if test_mode == "val" else "test"))
+        check_split_options(transforms, parser.eval_mode, parser.train_split_fraction, parser.eval_interval)
+        if test_mode == "val" and parser.load_3D_points:
+            check_seed_points(transforms)
 
 
 def _source(config: SSAPipelineConfig) -> Path:

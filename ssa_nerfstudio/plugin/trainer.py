@@ -23,7 +23,7 @@ from ssa_nerfstudio._system import ctrl_c
 from ssa_nerfstudio._system.environment import check_environment
 from ssa_nerfstudio.errors import InputError, TrainingError, TrainingStopped
 from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, resuming
-from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig
+from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig, check_data
 from ssa_nerfstudio.plugin.training.checkpoints import (
     LOAD_ERRORS,
     damage,
@@ -64,8 +64,14 @@ class SSATrainerConfig(TrainerConfig):
     """Scale every schedule by max_num_iterations / 30000, so that a shorter run is a complete run."""
 
     def set_timestamp(self) -> None:
-        """Set the timestamp as upstream; ns-train calls this first, so what it would fail at is checked here."""
+        """Set the timestamp as upstream; ns-train calls this first, so what it would fail at is checked here.
+
+        Raises:
+            InputError: a setting, the dataset or the checkpoint to resume from cannot be used.
+        """
         self.check()
+        check_data(self.pipeline)
+        check_checkpoint(self.load_dir, self.load_step, self.load_checkpoint)
         super().set_timestamp()
 
     def check(self) -> None:
@@ -133,7 +139,7 @@ class SSATrainer(Trainer):
         self.config.pipeline.artifacts_of = checkpoint = self._resumed_checkpoint()
         model, resumed = self.config.pipeline.model, checkpoint and load_pipeline_state(checkpoint)
         model.strategy = densification(model.strategy, self.config.max_num_iterations, resumed)
-        with self._stopped_in_one_line():
+        with self._no_config_left(), self._stopped_in_one_line():
             try:
                 super().setup(test_mode)
             except Exception as error:
@@ -271,6 +277,21 @@ class SSATrainer(Trainer):
             return
         with self._stopped_in_one_line(), ctrl_c.unwrapped():
             super().train()
+
+    @contextmanager
+    def _no_config_left(self) -> Iterator[None]:
+        """Let a run of `ns-train` that cannot begin leave nothing: its config.yml would be that of the newest run."""
+        try:
+            yield
+        except Exception:
+            config = self.base_dir / "config.yml"
+            if is_nerfstudio_command() and list(self.base_dir.glob("*")) == [config]:
+                config.unlink()
+                for folder in (self.base_dir, *self.base_dir.parents):
+                    if folder == Path(self.config.output_dir) or any(folder.iterdir()):
+                        break
+                    folder.rmdir()
+            raise
 
     @contextmanager
     def _stopped_in_one_line(self) -> Iterator[None]:

@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from zipfile import is_zipfile
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
@@ -164,12 +165,11 @@ def check_device(device: torch.device | str) -> None:
 
 
 def check_checkpoint(load_dir: Path | None, load_step: int | None, load_checkpoint: Path | None) -> None:
-    """Refuse to resume from a folder without checkpoints or a file that does not exist."""
+    """Refuse to resume from a folder without checkpoints or a file that is none."""
     if load_dir is None:
-        if load_checkpoint is not None and not load_checkpoint.exists():
-            raise InputError(
-                f"--load-checkpoint {load_checkpoint} does not exist", "give a step-*.ckpt of an earlier run"
-            )
+        if load_checkpoint is not None and not (load_checkpoint.is_file() and is_zipfile(load_checkpoint)):
+            what = "is no checkpoint" if load_checkpoint.exists() else "does not exist"
+            raise InputError(f"--load-checkpoint {load_checkpoint} {what}", "give a step-*.ckpt of an earlier run")
         return
     pattern = "step-*.ckpt" if load_step is None else f"step-{load_step:09d}.ckpt"
     if not list(load_dir.glob(pattern)):

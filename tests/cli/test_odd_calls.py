@@ -34,8 +34,8 @@ def readers(tmp_path, configure_training):
     def train(data: Path) -> int:
         model = {"overlay": "on", "overlay_start": "constant"}
         config = configure_training("ssa-splatfacto", data, tmp_path / "runs", 2, model)
-        config.set_timestamp()
         try:
+            config.set_timestamp()
             config.setup(local_rank=0, world_size=1).setup()
         except SSAError as error:  # as plugin/command_entry.py does it for ns-train
             return print_error(error)

@@ -179,6 +179,47 @@ def test_options_that_upstream_fails_at(options, says, refused, tiny_scene, tmp_
     assert list(tmp_path.iterdir()) == []
 
 
+NO_RUN = [
+    (("--data", "nope"), "nope/transforms.json does not exist"),
+    ((), "transforms.json does not exist"),
+    (("--data", "cut"), "cut/transforms.json is no valid JSON"),
+    (("--data", "{scene}", "--load-dir", "nope"), "--load-dir nope holds no step-*.ckpt"),
+    (("--data", "{scene}", "--load-dir", "cut", "--load-step", "3"), "--load-dir cut holds no step-000000003.ckpt"),
+    (("--data", "{scene}", "--load-checkpoint", "nope"), "--load-checkpoint nope does not exist"),
+    (("--data", "{scene}", "--load-checkpoint", "cut"), "--load-checkpoint cut is no checkpoint"),
+    (("--data", "{scene}", "--load-checkpoint", "cut/transforms.json"), "transforms.json is no checkpoint; give a"),
+    (("--data", "{scene}", "nerfstudio-data", "--downscale-factor", "3"), "images_3/train_0000.png does not exist"),
+]
+"""Options of `ns-train` where cut/transforms.json is truncated, and the line that they end in."""
+
+
+@pytest.mark.parametrize(("options", "says"), NO_RUN)
+def test_data_and_checkpoints_are_looked_at_before_anything_is_printed_or_written(
+    options, says, tiny_scene, tmp_path, monkeypatch, refused
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(METHODS["ssa-splatfacto"].__class__, "print_to_terminal", lambda _: pytest.fail("printed"))
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut/transforms.json").write_text('{"frames": [')
+    words = (word.format(scene=tiny_scene) for word in options)
+    assert says in refused("ns-train", "ssa-splatfacto", "--vis", "tensorboard", *words)
+    assert [path.name for path in tmp_path.rglob("*")] == ["cut", "transforms.json"]
+
+
+@pytest.mark.parametrize("before", [(), ("earlier",)])
+def test_what_only_the_photos_show_leaves_no_run(before, broken_scene, tmp_path, monkeypatch, refused):
+    monkeypatch.chdir(tmp_path)
+    photo = broken_scene / "images/train_0004.png"
+    photo.write_bytes(photo.read_bytes()[:200])
+    runs = Path("out", broken_scene.name, "ssa-splatfacto")
+    for name in before:
+        (runs / name).mkdir(parents=True)
+    words = ("--data", broken_scene, "--vis", "tensorboard", "--output-dir", "out")
+    assert "train_0004.png cannot be read" in refused("ns-train", "ssa-splatfacto", *words)
+    assert [path.name for path in runs.glob("*")] == [*before]
+    assert runs.parent.exists() == bool(before)
+
+
 @pytest.mark.parametrize("seed", [0, 2**32 - 1])
 def test_seeds_at_both_ends_are_taken(seed):
     config = copy.deepcopy(METHODS["ssa-splatfacto"])
