@@ -6,7 +6,7 @@ import copy
 import logging
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -19,8 +19,9 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ssa_nerfstudio._system import ctrl_c
+from ssa_nerfstudio._system import ctrl_c, termination
 from ssa_nerfstudio._system.environment import check_environment
+from ssa_nerfstudio._system.terminal_messages import print_error
 from ssa_nerfstudio.errors import InputError, TrainingError, TrainingStopped
 from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, resuming
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig, check_data
@@ -283,7 +284,7 @@ class SSATrainer(Trainer):
         """Let a run of `ns-train` that cannot begin leave nothing: its config.yml would be that of the newest run."""
         try:
             yield
-        except Exception:
+        except BaseException:  # of ctrl+c, too
             config = self.base_dir / "config.yml"
             if is_nerfstudio_command() and list(self.base_dir.glob("*")) == [config]:
                 config.unlink()
@@ -295,23 +296,27 @@ class SSATrainer(Trainer):
 
     @contextmanager
     def _stopped_in_one_line(self) -> Iterator[None]:
-        """Let ctrl+c in `ns-train` say how to go on; upstream prints a traceback and ends with exit code 0.
+        """Let ctrl+c in `ns-train`, or SIGTERM, say how to go on; after ctrl+c upstream ends with exit code 0.
 
         After the training it closes the viewer, as upstream asks for.
+
+        Raises:
+            SystemExit: the training was stopped, and has said so.
         """
-        try:
-            yield
-        except KeyboardInterrupt:
-            if not is_nerfstudio_command():
-                raise
-            if self.training_state == "completed":
-                return
-            saved = newest_first(self.checkpoint_dir)
-            if not saved:
-                raise TrainingStopped(f"at step {self.step}, before the first checkpoint", "start again") from None
-            raise TrainingStopped(
-                f"at step {self.step}", f"go on from step {step_of(saved[0])}: {resuming(self.checkpoint_dir)}"
-            ) from None
+        with termination.as_ctrl_c() if is_nerfstudio_command() else nullcontext():
+            try:
+                yield
+            except KeyboardInterrupt:
+                if not is_nerfstudio_command():
+                    raise
+                if self.training_state == "completed":
+                    return
+                saved = newest_first(self.checkpoint_dir)
+                at = f"at step {self.step}" if saved else f"at step {self.step}, before the first checkpoint"
+                remedy = "start again"
+                if saved:
+                    remedy = f"go on from step {step_of(saved[0])}: {resuming(self.checkpoint_dir)}"
+                raise SystemExit(print_error(TrainingStopped(at, remedy))) from None
 
 
 def machine() -> MachineConfig:

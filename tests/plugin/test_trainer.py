@@ -1,14 +1,14 @@
-"""What a training says last: after ctrl+c, and of its artifact."""
+"""What a training says last: after ctrl+c or SIGTERM, and of its artifact."""
 
 from __future__ import annotations
 
 import copy
+import signal
 import sys
 from types import SimpleNamespace
 
 import pytest
 
-from ssa_nerfstudio.errors import TrainingStopped
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.trainer import SSATrainer
@@ -45,19 +45,32 @@ def test_the_trainer_settles_the_densification_by_the_length_and_changes_no_conf
     assert config == before
 
 
-def test_ctrl_c_says_from_which_step_the_training_goes_on(trainer, tmp_path):
-    for step in (10, 20):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    ("saved", "says"),
+    [
+        ((10, 20), "; go on from step 20: ns-train ssa-splatfacto --load-dir {folder} --data photos"),
+        ((), ", before the first checkpoint; start again"),
+    ],
+)
+def test_a_training_that_is_stopped_says_how_it_goes_on(number, saved, says, trainer, tmp_path, capsys):
+    for step in saved:
         (tmp_path / f"step-{step:09d}.ckpt").touch()
-    with pytest.raises(TrainingStopped) as stopped, trainer._stopped_in_one_line():
-        raise KeyboardInterrupt
-    resumed = f"ns-train ssa-splatfacto --load-dir {tmp_path} --data photos"
-    assert str(stopped.value) == f"at step 25; go on from step 20: {resumed}"
+    with pytest.raises(SystemExit) as end, trainer._stopped_in_one_line():
+        signal.raise_signal(number)
+    assert end.value.code == 128 + number
+    assert capsys.readouterr().err == f"ssa-nerfstudio: stopped: at step 25{says.format(folder=tmp_path)}\n"
 
 
-def test_ctrl_c_before_the_first_checkpoint(trainer):
-    with pytest.raises(TrainingStopped) as stopped, trainer._stopped_in_one_line():
-        raise KeyboardInterrupt
-    assert str(stopped.value) == "at step 25, before the first checkpoint; start again"
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_training_that_is_stopped_before_it_began_leaves_no_run(number, trainer, tmp_path):
+    trainer.base_dir = tmp_path / "outputs/photos/now"
+    trainer.base_dir.mkdir(parents=True)
+    (trainer.base_dir / "config.yml").touch()
+    trainer.config.output_dir = tmp_path / "outputs"
+    with pytest.raises(SystemExit), trainer._no_config_left(), trainer._stopped_in_one_line():
+        signal.raise_signal(number)
+    assert list(tmp_path.rglob("*")) == [tmp_path / "outputs"]
 
 
 def test_ctrl_c_after_the_training_closes_the_viewer(trainer):
