@@ -76,7 +76,7 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
     """What bench and tradeoff share: brings the folder up to date with the runs; those that are left, or failed."""
 
     from ssa_nerfstudio.experiments.benchmark.execution import execute as bench
-    from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
+    from ssa_nerfstudio.experiments.benchmark.execution.datasets import check_captures, prepare
     from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import store_plan
     from ssa_nerfstudio.experiments.benchmark.results import Result, merge, read_all
 
@@ -93,10 +93,15 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         for run in runs:
             print(f"{done.get(run.id, 'to do'):<9} {run.id}")
         return [], []
+    for folder in command.merge:
+        if not (folder / "results").is_dir():
+            raise InputError(f"--merge {folder} holds no results", "name the --output folder of another ssa bench")
+    if command.prepare_only:
+        check_captures(runs, place.scenes, place.artifacts)
+    else:
+        bench.check(runs, place, command.merge)
     with place.locked():
         for folder in command.merge:
-            if not (folder / "results").is_dir():
-                raise InputError(f"--merge {folder} holds no results", "name the --output folder of another ssa bench")
             console.print(f"{counted(merge(folder, command.output), 'result')} taken over from {folder}")
         store_plan(command.output, name, benchmark, planned)
         if command.prepare_only:

@@ -45,6 +45,19 @@ def source(data: str) -> Path:
     return path
 
 
+def check_captures(runs: list[Run], folder: Path, artifacts: Path) -> None:
+    """Check what `prepare` reads, without opening a photo.
+
+    Raises:
+        InputError: a capture or the mask of its artifact is missing, or a capture cannot be used.
+    """
+    for run in {run.dataset: run for run in runs}.values():
+        if run.mask and not mask_path(run, artifacts).exists():
+            _stated_mask(run)
+        if run.data != DEMO and not (folder / run.dataset).exists():
+            Dataset.read(source(run.data), run.eval_interval)
+
+
 def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> None:
     """Makes the datasets of runs that are not there yet, each appearing when it is complete.
 
@@ -59,7 +72,7 @@ def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> Non
     """
     for run in {run.dataset: run for run in runs}.values():
         if run.mask and not (mask := mask_path(run, artifacts)).exists():
-            _keep_mask(source(run.data) / run.mask, mask)
+            _keep_mask(_stated_mask(run), mask)
         if not (folder / run.dataset).exists():
             dataset = _clean(run, folder, threads)
             effects = () if run.real or run.effect == CLEAN else read_effects((run.effect,))
@@ -136,9 +149,14 @@ def _with_photos_of(dataset: Dataset, folder: str) -> Dataset:
     return replace(dataset, transforms=replace(dataset.transforms, meta=meta))
 
 
-def _keep_mask(mask: Path, kept: Path) -> None:
+def _stated_mask(run: Run) -> Path:
+    mask = source(run.data) / run.mask
     if not mask.is_file():
         raise InputError(f"{mask} does not exist", "put the mask of the artifact there, or state no mask")
+    return mask
+
+
+def _keep_mask(mask: Path, kept: Path) -> None:
     kept.parent.mkdir(parents=True, exist_ok=True)
     with staged_file(kept) as part:
         part.write_bytes(mask.read_bytes())

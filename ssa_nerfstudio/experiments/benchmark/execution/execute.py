@@ -13,7 +13,7 @@ from rich.console import Console
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.benchmark.execution.dask_runner import DaskRunner
-from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
+from ssa_nerfstudio.experiments.benchmark.execution.datasets import check_captures, prepare
 from ssa_nerfstudio.experiments.benchmark.execution.progress_table import ProgressTable
 from ssa_nerfstudio.experiments.benchmark.execution.results_folder import ResultsFolder
 from ssa_nerfstudio.experiments.benchmark.execution.run_process import configuration
@@ -74,7 +74,7 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
         The runs that were not done for lack of time.
 
     Raises:
-        InputError: a run has a setting that its model has not, or its dataset cannot be made.
+        InputError: a dataset cannot be made.
     """
     began = time.monotonic()
     deadline = None if options.time_limit is None else began + 60 * options.time_limit
@@ -87,9 +87,7 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
     names: dict[str, list[Run]] = {}  # of each training, in the order of their importance
     for run in missing:
         names.setdefault(run.training, []).append(run)
-    todo = [same[0] for training, same in names.items() if training not in known]
-    for run in todo:
-        _check_settings(run, place)
+    todo = _untrained(runs, results)
     prepare(todo, place.scenes, place.artifacts, options.threads)
 
     def command(run: Run) -> str:
@@ -117,6 +115,34 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
         runner = DaskRunner(place, found, options.runs_per_device, command, options.keep_models, options.scheduler)
         left = runner.work(todo, estimate.seconds, deadline, table.watch, ended)
     return [same for run in left for same in names[run.training]]
+
+
+def check(runs: list[Run], place: ResultsFolder, merged: tuple[Path, ...] = ()) -> None:
+    """Check what is to be trained, before anything is written.
+
+    Args:
+        runs: as `bench` takes them.
+        place: the output folder.
+        merged: further folders whose results count.
+
+    Raises:
+        InputError: a run has a setting that its model has not, or its capture is missing or cannot be used.
+    """
+    todo = _untrained(runs, read_all([place.folder, *merged])[0])
+    for run in todo:
+        _check_settings(run, place)
+    check_captures(todo, place.scenes, place.artifacts)
+
+
+def _untrained(runs: list[Run], results: list[Result]) -> list[Run]:
+    """Of each training that no run has finished, the first run."""
+    done = {result.run.id for result in results if result.status != "failed"}
+    known = {result.run.training for result in results if result.status != "failed"}
+    first: dict[str, Run] = {}
+    for run in runs:
+        if run.id not in done and run.training not in known:
+            first.setdefault(run.training, run)
+    return list(first.values())
 
 
 def _check_settings(run: Run, place: ResultsFolder) -> None:
