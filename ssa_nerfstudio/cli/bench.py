@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from ssa_nerfstudio._system import ctrl_c
 from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
@@ -100,12 +103,12 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
         check_captures(runs, place.scenes, place.artifacts)
     else:
         bench.check(runs, place, command.merge)
-    with place.locked():
+    with place.locked(), _continued(command.output):
         for folder in command.merge:
             console.print(f"{counted(merge(folder, command.output), 'result')} taken over from {folder}")
         store_plan(command.output, name, benchmark, planned)
         if command.prepare_only:
-            prepare(runs, place.scenes, place.artifacts, command.threads)
+            prepare(runs, place.scenes, place.artifacts, command.threads, console)
             console.print(f"{counted(len({run.dataset for run in runs}), 'dataset')} ready in {place.scenes}")
             return [], []
         options = bench.Options(
@@ -124,6 +127,16 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
     results = {result.run.id: result for result in read_all([command.output])[0]}
     ended = [results.get(run.id) or Result(run, "failed", "it left no result") for run in runs if run not in left]
     return left, [result for result in ended if result.status == "failed"]
+
+
+@contextmanager
+def _continued(output: Path) -> Iterator[None]:
+    """Say of a benchmark that is stopped that the same command goes on with it."""
+    try:
+        with ctrl_c.unwrapped():
+            yield
+    except KeyboardInterrupt as interrupt:
+        raise KeyboardInterrupt(f"stopped; the same command continues in {output}") from interrupt
 
 
 def require_none(failed: list[Result]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import fcntl
 import shutil
+import signal
 import subprocess
 import sys
 import threading
@@ -153,6 +154,18 @@ def test_datasets_can_be_prepared_ahead_and_drawn_effects_suffice(tmp_path, monk
     for name in ("images/train_0003.png", "layers/undistorted_B.png", "transforms.json"):
         there, here = (tmp_path / side / "scenes" / "demo-rain" / name for side in ("there", "here"))
         assert there.read_bytes() == here.read_bytes()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_benchmark_that_is_stopped_says_what_it_did_and_how_it_goes_on(number, tmp_path):
+    words = [*SSA, "bench", "smoke", "--output", "out"]
+    running = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+    assert running.stdout is not None
+    assert running.stdout.readline() == "Making the dataset demo-dashboard ...\n"
+    running.send_signal(number)
+    _, err = running.communicate(timeout=60)
+    assert running.returncode == 128 + number
+    assert err == "stopped; the same command continues in out\n"
 
 
 @pytest.mark.slow

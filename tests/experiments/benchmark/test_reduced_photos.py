@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 
 from PIL import Image
+from rich.console import Console
 
 from ssa_nerfstudio.experiments.benchmark.execution.datasets import prepare
 from ssa_nerfstudio.experiments.benchmark.specification.benchmark_file import Benchmark, Part, SceneEntry
@@ -17,7 +18,7 @@ def test_photos_are_reduced_once(tiny_scene, tmp_path):
     folder = tmp_path / "scenes"
     written = []
     for _ in range(2):
-        prepare(runs, folder, tmp_path / "artifacts", 1)
+        prepare(runs, folder, tmp_path / "artifacts", 1, Console())
         photos = (folder / runs[0].dataset).rglob("*.png")
         assert {Image.open(photo).size for photo in photos} == {(32, 24)}
         shutil.rmtree(folder / runs[0].dataset)

@@ -11,6 +11,7 @@ from string import Template
 
 import numpy as np
 from PIL import Image
+from rich.console import Console
 
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.transforms import SPLITS
@@ -58,7 +59,7 @@ def check_captures(runs: list[Run], folder: Path, artifacts: Path) -> None:
             Dataset.read(source(run.data), run.eval_interval)
 
 
-def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> None:
+def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int, console: Console) -> None:
     """Makes the datasets of runs that are not there yet, each appearing when it is complete.
 
     Args:
@@ -66,6 +67,7 @@ def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> Non
         folder: where datasets go, by `Run.dataset`.
         artifacts: where drawn effects are kept, so that a machine without albumentations can use them.
         threads: photos worked on at once.
+        console: says which dataset is being made.
 
     Raises:
         InputError: a capture is missing or cannot be used.
@@ -74,6 +76,7 @@ def prepare(runs: list[Run], folder: Path, artifacts: Path, threads: int) -> Non
         if run.mask and not (mask := mask_path(run, artifacts)).exists():
             _keep_mask(_stated_mask(run), mask)
         if not (folder / run.dataset).exists():
+            console.print(f"Making the dataset {run.dataset} ...")
             dataset = _clean(run, folder, threads)
             effects = () if run.real or run.effect == CLEAN else read_effects((run.effect,))
             scene = KeptScene(effects, run.effect_seed, run.exposure, run.effect, artifacts)

@@ -88,7 +88,7 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
     for run in missing:
         names.setdefault(run.training, []).append(run)
     todo = _untrained(runs, results)
-    prepare(todo, place.scenes, place.artifacts, options.threads)
+    prepare(todo, place.scenes, place.artifacts, options.threads, console)
 
     def command(run: Run) -> str:
         return f"{invocation} --output {shlex.quote(str(place.folder))} --only {shlex.quote(run.id)}"
