@@ -61,8 +61,13 @@ class DatasetExport:
             frame: of photos and masks; auto: the program's own.
 
         Raises:
-            InputError: the program cannot read photos in that frame or of that camera, or poses or points are broken.
+            InputError: the program cannot read photos in that frame or of that camera, poses or points are broken, or
+                holes are asked for in original photos.
         """
+        if masks == "holes" and photos == "original":
+            raise InputError(
+                "--masks holes: nothing is missing in original photos", "add --photos cleaned, or choose other masks"
+            )
         if dataset.transforms.camera_model in OTHER_MODELS:
             raise InputError(
                 f"{dataset.transforms.path}: camera_model {dataset.transforms.camera_model} cannot be exported",
