@@ -27,9 +27,17 @@ class Command:
     """Photos of --data are resized by this, in (0, 1]."""
 
     def run(self) -> None:
-        """Train, print the tables, write the report."""
-        if self.steps < 1 or not 0 < self.scale_factor <= 1:
-            raise InputError("--steps must be at least 1 and --scale-factor in (0, 1]")
+        """Train, print the tables, write the report.
+
+        Raises:
+            SSAError: an option or the dataset cannot be used, or a training cannot continue.
+        """
+        if self.steps < 1:
+            raise InputError(f"--steps must be at least 1, got {self.steps}")
+        if not 0 < self.scale_factor <= 1:
+            raise InputError(f"--scale-factor must be in (0, 1], got {self.scale_factor:g}")
+        if self.data is None and self.scale_factor != 1:
+            raise InputError("--scale-factor is for the photos of --data", "add --data, or leave it out")
         if self.data is not None:
             from ssa_nerfstudio.data.training_requirements import check_training
             from ssa_nerfstudio.data.transforms import Transforms

@@ -57,6 +57,8 @@ class Command:
         for name, lowest in (("seed", 0), ("threads", 1), ("eval_interval", 2), ("downscale_factor", 1)):
             if (value := getattr(self, name)) is not None and value < lowest:
                 raise InputError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
+        if self.data is None and self.downscale_factor != 1:
+            raise InputError("--downscale-factor is for the photos of --data", "add --data, or leave it out")
         scene = Scene(read_effects(self.effects)) if self.effects is not None else read_scene(str(self.scene))
         if self.seed is not None:
             scene = dataclasses.replace(scene, seed=self.seed)
