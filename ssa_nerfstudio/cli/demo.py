@@ -51,7 +51,8 @@ class Command:
 
         title = TextColumn("{task.description}", markup=False)
         columns = (title, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console) as progress:
+        # Without a terminal, a finished bar leaves an empty line.
+        with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
             tasks = {}
 
             def on_step(dataset: str, method: str, step: int) -> None:

@@ -75,10 +75,9 @@ class Command:
         artifact = self._artifact(dataset, data)
         export = DatasetExport(dataset, artifact, self.program, self.photos, self.masks, self.frame)
         with staged_folder(self.output) as folder:
-            shown = track(
-                export.write_photos(folder), "Photos", total=len(export.views), console=console, transient=True
-            )
-            photos = list(shown)
+            # Without a terminal, a finished bar leaves an empty line.
+            bar = {"console": console, "transient": True, "disable": not console.is_terminal}
+            photos = list(track(export.write_photos(folder), "Photos", total=len(export.views), **bar))
             export.write_poses(folder, photos)
         left = sum(photo.left for photo in photos) / len(photos)
         console.print(

@@ -90,7 +90,9 @@ class Command:
             written = write_overlay(folder, checkpoint, raw if self.raw_frame else undistorted, self.threshold)
             write_exposure(checkpoint, folder)
             photos_done = restore_photos(self.apply or folder, photos, frames, folder, self.threshold)
-            written_photos = list(track(photos_done, "Photos", total=len(photos), console=console, transient=True))
+            # Without a terminal, a finished bar leaves an empty line.
+            bar = {"console": console, "transient": True, "disable": not console.is_terminal}
+            written_photos = list(track(photos_done, "Photos", total=len(photos), **bar))
             recovered = [photo for photo in written_photos if photo.shows]
             if photos and not recovered:
                 raise InputError(

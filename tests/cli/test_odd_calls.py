@@ -183,6 +183,7 @@ def test_an_odd_call(case, inputs, tmp_path, monkeypatch, capsys):
     out, err = capsys.readouterr()
     judge(case, "", code, err, tmp_path)
     assert case.get("prints", "") in out
+    assert "" not in [line.strip() for line in out.splitlines()][:1], "it begins with an empty line"
     assert {path.name for path in folder.iterdir()} - there == {*case.get("after", [])}
     assert contents(Path(inputs["file"]).parent) == before
 

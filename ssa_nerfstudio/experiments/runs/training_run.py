@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
+import rich
 import torch
 from nerfstudio.utils.rich_utils import CONSOLE
 
@@ -82,9 +83,12 @@ def train_and_evaluate(
         Diverged: a Gaussian is not finite, none can be seen any more, or the guards gave the training up.
     """
     start = time.perf_counter()
-    quiet, CONSOLE.quiet = CONSOLE.quiet, True
+    others = CONSOLE, rich.get_console()  # nerfstudio's messages, and its bars, of which a file gets empty lines
+    former = [other.quiet for other in others]
     flips = FlipProcesses(flip_processes)
     try:
+        for other in others:
+            other.quiet = True
         begin_run(config)
         # Not in config.yml, which other commands load.
         config.pipeline._target, config.pipeline.datamanager._target = TimedPipeline, TimedDatamanager
@@ -104,7 +108,8 @@ def train_and_evaluate(
         evaluated = clock.paused + time.perf_counter() - began
     finally:
         flips.close()
-        CONSOLE.quiet = quiet
+        for other, quiet in zip(others, former, strict=True):
+            other.quiet = quiet
     outcome = Outcome(
         metrics=mean_metrics(views),
         seconds={

@@ -15,6 +15,7 @@ def demo(*arguments: object) -> str:
     command = [sys.executable, "-m", "ssa_nerfstudio", "demo", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+    assert "" not in done.stdout.splitlines()[:2], "there is an empty line where a bar would be"
     return " ".join(done.stdout.split())
 
 
