@@ -145,7 +145,9 @@ class SSATrainer(Trainer):
                 super().setup(test_mode)
             except Exception as error:
                 if type(error).__module__.startswith("wandb.") or "COMET_API_KEY" in str(error):
-                    raise InputError(f"--vis {self.config.vis}: {error}", "or choose --vis tensorboard") from error
+                    raise InputError(
+                        f"--vis {self.config.vis}: {str(error).rstrip('.')}", "or choose --vis tensorboard"
+                    ) from error
                 raise
         thin_event_writers(self.config.logging.steps_per_log)
         last = (self.config.max_num_iterations - 1,)
@@ -177,7 +179,8 @@ class SSATrainer(Trainer):
             path = file if folder is None else folder / f"step-{step:09d}.ckpt"
             error = (path and damage(path)) or self._load_one()
             if error is not None:
-                raise InputError(f"{file or folder} cannot be read ({error})", "name another checkpoint: --load-step")
+                option = "--load-checkpoint" if folder is None else "--load-step"
+                raise InputError(f"{path} cannot be read ({error})", f"name another checkpoint: {option}")
             return
         candidates = newest_first(folder)
         for candidate in candidates:

@@ -152,17 +152,30 @@ def test_resuming_from_an_empty_folder_is_refused(tiny_scene, tmp_path, train):
     assert "holds no step-*.ckpt" in refusal(lambda: train(tiny_scene, tmp_path / "out", load_dir=tmp_path))
 
 
-@pytest.mark.parametrize("named", [False, True])
-def test_resuming_from_half_a_checkpoint_is_refused(
-    tiny_scene, tmp_path, named, train, configure_training, train_and_evaluate
+@pytest.mark.parametrize(
+    ("option", "says"),
+    [
+        ("load_dir", "nerfstudio_models holds no checkpoint that can be read"),
+        ("load_step", "step-000000001.ckpt cannot be read (the checksum"),
+        ("load_checkpoint", "step-000000001.ckpt cannot be read (the checksum"),
+    ],
+)
+def test_resuming_from_a_damaged_checkpoint_is_refused(
+    tiny_scene, tmp_path, option, says, train, configure_training, train_and_evaluate
 ):
     config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 2, {"num_downscales": 0})
     _, _, path = train_and_evaluate(config)
     checkpoint = next((path.parent / "nerfstudio_models").glob("*.ckpt"))
-    checkpoint.write_bytes(checkpoint.read_bytes()[:5000])
-    options = {"load_dir": checkpoint.parent, "load_step": 1 if named else None}
+    content = bytearray(checkpoint.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    checkpoint.write_bytes(content)
+    options = {"load_dir": checkpoint.parent, "load_step": 1 if option == "load_step" else None}
+    if option == "load_checkpoint":
+        options = {"load_checkpoint": checkpoint}
     message = refusal(lambda: train(tiny_scene, tmp_path / "out", 4, **options))
-    assert ("--load-step" if named else "holds no checkpoint that can be read") in message
+    assert says in message
+    if option != "load_dir":
+        assert message.endswith(f"; name another checkpoint: --{option.replace('_', '-')}")
 
 
 def test_resuming_a_learned_overlay_with_a_given_one_is_refused(

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.trainer import SSATrainer
@@ -77,6 +78,17 @@ def test_ctrl_c_after_the_training_closes_the_viewer(trainer):
     trainer.training_state = "completed"
     with trainer._stopped_in_one_line():
         raise KeyboardInterrupt
+
+
+def test_a_log_in_that_fails_is_said_with_the_way_around_it(trainer, monkeypatch):
+    def fail(*_: object) -> None:
+        raise ValueError("set COMET_API_KEY to log in.")
+
+    monkeypatch.setattr("nerfstudio.engine.trainer.Trainer.setup", fail)
+    trainer.config.vis = "comet"
+    trainer.base_dir = trainer.checkpoint_dir
+    with pytest.raises(InputError, match=r"--vis comet: set COMET_API_KEY to log in; or choose --vis tensorboard$"):
+        trainer.setup()
 
 
 @pytest.mark.parametrize(("overlay", "why"), [("off", "the overlay was off"), ("auto", "none was detected")])
