@@ -11,6 +11,7 @@ from pathlib import Path
 
 from filelock import FileLock, Timeout
 
+from ssa_nerfstudio._system.unwritable_output import unwritable
 from ssa_nerfstudio.errors import InputError
 
 LOCK = ".lock"
@@ -37,9 +38,7 @@ def locked_folder(folder: Path, command: str) -> Iterator[None]:
             f"another {command} is at work in {folder}", "wait until it ends, or choose another output folder"
         ) from error
     except OSError as error:
-        raise InputError(
-            f"{folder} cannot be written ({error})", "free space there or choose another output folder"
-        ) from error
+        raise unwritable(folder, error) from error
     try:
         yield
     finally:

@@ -155,6 +155,11 @@ def read_source(path: Path, name: str, min_photos: int) -> Source:
         known = ", ".join(sorted(suffix[1:] for suffix in PHOTO_SUFFIXES | VIDEO_SUFFIXES))
         if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file():
             raise InputError(f"{path} is one photo", f"give the folder of all photos, {path.parent}")
+        if path.is_file():
+            videos = ", ".join(sorted(suffix[1:] for suffix in VIDEO_SUFFIXES))
+            raise InputError(
+                f"{path} is neither a folder nor a video ({videos})", "give a folder of photos, of videos, or a video"
+            )
         below = (file for file in islice(path.rglob("[!.]*"), _LOOKED_AT) if file.suffix.lower() in PHOTO_SUFFIXES)
         first = next((file for file in below if is_file(file)), None)
         remedy = "put them there or name another folder" if first is None else f"give {first.parent}, which does"

@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from ssa_nerfstudio._system.file_lock import held
+from ssa_nerfstudio._system.unwritable_output import unwritable
 from ssa_nerfstudio.errors import InputError
 
 _PART = ".part"
@@ -42,7 +43,7 @@ def unwritable_as_input_error(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(f"{path} cannot be written ({error})", "free space there or choose another place") from error
+        raise unwritable(path, error) from error
 
 
 @contextmanager
