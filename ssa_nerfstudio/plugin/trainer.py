@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 import logging
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -19,11 +17,9 @@ from nerfstudio.engine.trainer import TRAIN_INTERATION_OUTPUT, Trainer, TrainerC
 from nerfstudio.utils.decorators import check_main_thread
 from nerfstudio.utils.rich_utils import CONSOLE
 
-from ssa_nerfstudio._system import ctrl_c, termination
+from ssa_nerfstudio._system import ctrl_c
 from ssa_nerfstudio._system.environment import check_environment
-from ssa_nerfstudio._system.terminal_messages import print_error
-from ssa_nerfstudio.errors import InputError, TrainingError, TrainingStopped
-from ssa_nerfstudio.plugin.command_entry import is_nerfstudio_command, resuming
+from ssa_nerfstudio.errors import InputError, TrainingError
 from ssa_nerfstudio.plugin.pipeline import SSAPipeline, SSAPipelineConfig, check_data
 from ssa_nerfstudio.plugin.training.checkpoints import (
     LOAD_ERRORS,
@@ -38,6 +34,7 @@ from ssa_nerfstudio.plugin.training.event_writers import gradient_norms, thin_ev
 from ssa_nerfstudio.plugin.training.nonfinite import CHECK_EVERY, NonFiniteGuard, first_nonfinite
 from ssa_nerfstudio.plugin.training.optimizers import JointOptimizers
 from ssa_nerfstudio.plugin.training.schedules import densification, scaled
+from ssa_nerfstudio.plugin.unfinished_run import no_config_left, stopped_in_one_line
 from ssa_nerfstudio.plugin.validation import (
     check_checkpoint,
     check_device,
@@ -140,7 +137,7 @@ class SSATrainer(Trainer):
         self.config.pipeline.artifacts_of = checkpoint = self._resumed_checkpoint()
         model, resumed = self.config.pipeline.model, checkpoint and load_pipeline_state(checkpoint)
         model.strategy = densification(model.strategy, self.config.max_num_iterations, resumed)
-        with self._no_config_left(), self._stopped_in_one_line():
+        with no_config_left(self), stopped_in_one_line(self):
             try:
                 super().setup(test_mode)
             except Exception as error:
@@ -279,47 +276,8 @@ class SSATrainer(Trainer):
         if self.config.max_num_iterations == 0:
             CONSOLE.print(f"The checkpoint is at step {self._start_step} of {planned}: nothing is left to train.")
             return
-        with self._stopped_in_one_line(), ctrl_c.unwrapped():
+        with stopped_in_one_line(self), ctrl_c.unwrapped():
             super().train()
-
-    @contextmanager
-    def _no_config_left(self) -> Iterator[None]:
-        """Let a run of `ns-train` that cannot begin leave nothing: its config.yml would be that of the newest run."""
-        try:
-            yield
-        except BaseException:  # of ctrl+c, too
-            config = self.base_dir / "config.yml"
-            if is_nerfstudio_command() and list(self.base_dir.glob("*")) == [config]:
-                config.unlink()
-                for folder in (self.base_dir, *self.base_dir.parents):
-                    if folder == Path(self.config.output_dir) or any(folder.iterdir()):
-                        break
-                    folder.rmdir()
-            raise
-
-    @contextmanager
-    def _stopped_in_one_line(self) -> Iterator[None]:
-        """Let ctrl+c in `ns-train`, or SIGTERM, say how to go on; after ctrl+c upstream ends with exit code 0.
-
-        After the training it closes the viewer, as upstream asks for.
-
-        Raises:
-            SystemExit: the training was stopped, and has said so.
-        """
-        with termination.as_ctrl_c() if is_nerfstudio_command() else nullcontext():
-            try:
-                yield
-            except KeyboardInterrupt:
-                if not is_nerfstudio_command():
-                    raise
-                if self.training_state == "completed":
-                    return
-                saved = newest_first(self.checkpoint_dir)
-                at = f"at step {self.step}" if saved else f"at step {self.step}, before the first checkpoint"
-                remedy = "start again"
-                if saved:
-                    remedy = f"go on from step {step_of(saved[0])}: {resuming(self.checkpoint_dir)}"
-                raise SystemExit(print_error(TrainingStopped(at, remedy))) from None
 
 
 def machine() -> MachineConfig:

@@ -14,6 +14,7 @@ from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.methods import METHODS
 from ssa_nerfstudio.plugin.trainer import SSATrainer
 from ssa_nerfstudio.plugin.training.densification import MarkovChainMonteCarlo
+from ssa_nerfstudio.plugin.unfinished_run import no_config_left, stopped_in_one_line
 
 
 @pytest.fixture
@@ -57,7 +58,7 @@ def test_the_trainer_settles_the_densification_by_the_length_and_changes_no_conf
 def test_a_training_that_is_stopped_says_how_it_goes_on(number, saved, says, trainer, tmp_path, capsys):
     for step in saved:
         (tmp_path / f"step-{step:09d}.ckpt").touch()
-    with pytest.raises(SystemExit) as end, trainer._stopped_in_one_line():
+    with pytest.raises(SystemExit) as end, stopped_in_one_line(trainer):
         signal.raise_signal(number)
     assert end.value.code == 128 + number
     assert capsys.readouterr().err == f"ssa-nerfstudio: stopped: at step 25{says.format(folder=tmp_path)}\n"
@@ -69,14 +70,14 @@ def test_a_training_that_is_stopped_before_it_began_leaves_no_run(number, traine
     trainer.base_dir.mkdir(parents=True)
     (trainer.base_dir / "config.yml").touch()
     trainer.config.output_dir = tmp_path / "outputs"
-    with pytest.raises(SystemExit), trainer._no_config_left(), trainer._stopped_in_one_line():
+    with pytest.raises(SystemExit), no_config_left(trainer), stopped_in_one_line(trainer):
         signal.raise_signal(number)
     assert list(tmp_path.rglob("*")) == [tmp_path / "outputs"]
 
 
 def test_ctrl_c_after_the_training_closes_the_viewer(trainer):
     trainer.training_state = "completed"
-    with trainer._stopped_in_one_line():
+    with stopped_in_one_line(trainer):
         raise KeyboardInterrupt
 
 
