@@ -64,6 +64,7 @@ class Command:
         from ssa_nerfstudio.evidence.capture_detection import FILES
 
         data = self.data.resolve()
+        data = data.parent if data.name == "transforms.json" else data
         place = Path("outputs/detection") / ((data.name if data.is_dir() else data.stem) or "root")
         other = [path.name for path in place.rglob("*") if not path.is_dir() and path.name not in FILES]
         if other or place.is_symlink():
