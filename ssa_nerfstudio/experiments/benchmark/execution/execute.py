@@ -127,7 +127,10 @@ def check(runs: list[Run], place: ResultsFolder, merged: tuple[Path, ...] = ()) 
 
     Raises:
         InputError: a run has a setting that its model has not, or its capture is missing or cannot be used.
+        ModuleNotFoundError: the runs' scheduler is not installed.
     """
+    import distributed  # noqa: F401 - by the runner, after minutes of making datasets
+
     todo = _untrained(runs, read_all([place.folder, *merged])[0])
     for run in todo:
         _check_settings(run, place)
