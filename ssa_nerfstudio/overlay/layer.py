@@ -12,13 +12,7 @@ from torch import Tensor, nn
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.overlay.compositing import composite, composite_logits, composite_over_splats
-from ssa_nerfstudio.overlay.resampling import (
-    letterbox,
-    premultiply,
-    reduced_size,
-    smallest_matte,
-    to_training_scale,
-)
+from ssa_nerfstudio.overlay.resampling import letterbox, premultiply, reduced_size, smallest_matte, to_training_scale
 
 CONSTANT_INITIALIZATION = (0.5, 0.1)
 """Initial color and matte of the paper's ablation "constant start"."""

@@ -45,6 +45,8 @@ class Artifacts(nn.Module):
         self._keys: list[list[float]] = []
         self._bare: list[list[float]] = []
         self._group_of_view: list[int | None] = []
+        self.photo_shares: list[float] = []
+        """Share of the training views that show each overlay, in [0, 1]."""
         self.starts: list[str] = []
         """First photo of each group (`cameras.intervals`), of those with an overlay before the others."""
         self.cameras: list[str] = []
@@ -88,7 +90,7 @@ class Artifacts(nn.Module):
         order = [group for there in (True, False) for group, c in enumerate(covered.tolist()) if c == there]
         self.starts, self.cameras = [starts[group] for group in order], [cameras[group] for group in order]
         place = torch.where(covered, covered.cumsum(0) - 1, -1).tolist()
-        self._group_of_view = [place[group] if place[group] >= 0 else None for group in groups]
+        self._remember_views([place[group] if place[group] >= 0 else None for group in groups])
 
     @property
     def exceed_white(self) -> bool:
@@ -102,10 +104,6 @@ class Artifacts(nn.Module):
     def group_of_view(self, view: int) -> int | None:
         """The group of a training view; None where it has no overlay."""
         return self._group_of_view[view]
-
-    def photo_share(self, group: int) -> float:
-        """Share of the training views that show a group's overlay, in [0, 1]."""
-        return self._group_of_view.count(group) / len(self._group_of_view)
 
     def of_view(self, view: int) -> Overlay | None:
         """The overlay of a training view; None where it has none."""
@@ -251,7 +249,7 @@ class Artifacts(nn.Module):
             )
         known = cameras_in(state, prefix)
         if not len(known):  # checkpoints from before groups without an overlay were recorded
-            self._group_of_view = [None] * len(groups)
+            self._remember_views([None] * len(groups))
             return
         places: list[int] = []
         for key in keys:
@@ -267,7 +265,12 @@ class Artifacts(nn.Module):
         self._remember_keys()
         self.set_extra_state(names_in(state, prefix))
         found = [self.at_photo(places[group], photo) for group, photo in zip(groups, photos, strict=True)]
-        self._group_of_view = [place if place < len(self) else None for place in found]
+        self._remember_views([place if place < len(self) else None for place in found])
+
+    def _remember_views(self, group_of_view: list[int | None]) -> None:
+        self._group_of_view = group_of_view
+        views = max(1, len(group_of_view))  # of a checkpoint that is only exported there are none
+        self.photo_shares = [group_of_view.count(group) / views for group in range(len(self))]
 
     def _remember_keys(self) -> None:
         self._keys, self._bare = self.camera_keys.tolist(), self.bare_keys.tolist()

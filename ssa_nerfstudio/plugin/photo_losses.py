@@ -63,8 +63,8 @@ class PhotoLosses(SplatfactoModel):
         if self._sparsity_counts():
             learned = self.artifacts.learned()  # all overlays, or none
             # Of all overlays at every step, each as often as its photos are shown.
-            shares = [self.artifacts.photo_share(group) for group in range(len(learned))]
-            terms = [self._sparsity(overlay, share) for overlay, share in zip(learned, shares, strict=True)]
+            pairs = zip(learned, self.artifacts.photo_shares, strict=True)
+            terms = [self._sparsity(overlay, share) for overlay, share in pairs]
             losses["sparsity"] = torch.stack(terms).sum() if terms[1:] else terms[0]
         return losses
 
