@@ -21,6 +21,7 @@ from ssa_nerfstudio.cli.option_bounds import Count, file_to_write
 from ssa_nerfstudio.data.dataset import Dataset
 from ssa_nerfstudio.data.sources import read_source
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.experiments.simulation.scene import Scene, read_effects
 from ssa_nerfstudio.experiments.simulation.simulator import simulate
 from ssa_nerfstudio.sfm.photos_to_dataset import process
@@ -132,7 +133,7 @@ class Command:
             InputError: a dataset or an effect cannot be used, or `output` holds something else.
         """
         read_effects(tuple(effect for effect in self.effects if effect != "none"))
-        done = _earlier(self.output) if self.output.exists() else []
+        done = read_lines(self.output, ("data", "artifact", "way"))
         for data in self.data:
             for effect in self.effects:
                 ways = [way for way in self.ways if effect != "none" or way in ("COLMAP", "default")]
@@ -160,15 +161,6 @@ class Command:
                 print(result, flush=True)
                 with self.output.open("a") as file:
                     file.write(result + "\n")
-
-
-def _earlier(path: Path) -> list[dict[str, object]]:
-    """Results of earlier calls."""
-    try:
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        return [line for line in lines if (line["data"], line["artifact"], line["way"])]
-    except (ValueError, TypeError, LookupError) as error:
-        raise InputError(f"{path} holds no results of this script ({error})", "choose another --output") from error
 
 
 def _open_part(layers: Path) -> np.ndarray:

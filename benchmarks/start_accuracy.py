@@ -29,6 +29,7 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initializ
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
+from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 LAYERS = "layers/undistorted.npz"
@@ -87,7 +88,8 @@ class Command:
             raise InputError("no dataset is given", "add --data DIR, as ssa simulate writes it")
         for path in self.data:
             _check(path)
-        lines = _earlier(self.output) if self.output is not None and self.output.exists() else []
+        keys = "data", "constant", "factor"
+        lines = [] if self.output is None else read_lines(self.output, keys, since="verdict")
         known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
         groups = [*DETECTION.items(), *ESTIMATE.items()] if self.vary else []
         constants = [f"{module}.{name}" for module, names in groups for name in names]
@@ -102,15 +104,6 @@ class Command:
                         file.write(json.dumps(result) + "\n")
         if self.vary:
             _print_sensitivity(known, [path.name for path in self.data], constants)
-
-
-def _earlier(path: Path) -> list[dict[str, Any]]:
-    """Results of earlier calls. What an earlier revision wrote, which did not state the verdict, is measured again."""
-    try:
-        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        return [line for line in lines if "verdict" in line and (line["data"], line["constant"], line["factor"])]
-    except (ValueError, TypeError, LookupError) as error:
-        raise InputError(f"{path} holds no results of this script ({error})", "choose another --output") from error
 
 
 def _check(path: Path) -> None:
