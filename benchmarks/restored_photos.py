@@ -10,13 +10,12 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated
 
 import numpy as np
 from PIL import Image
 
 from ssa_nerfstudio.cli import run_script
-from ssa_nerfstudio.cli.option_bounds import Bound
+from ssa_nerfstudio.cli.option_bounds import Share
 from ssa_nerfstudio.data.photos import read_photo
 from ssa_nerfstudio.errors import InputError
 
@@ -34,7 +33,7 @@ class Command:
     """Folder of photos with the artifact."""
     clean: Path
     """Folder of their clean counterparts, of the same names up to the suffix; others are ignored."""
-    threshold: Annotated[float, Bound("in (0, 1)", lambda value: 0 < value < 1)] = 0.5
+    threshold: Share = 0.5
     """Matte above which a pixel counts as hidden."""
 
     def run(self) -> None:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import logging
 import os
 import sys
+from collections.abc import Iterable
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from ssa_nerfstudio.errors import InputError, SSAError, TrainingError, TrainingStopped
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+T = TypeVar("T")
 
 INPUT_EXIT_CODE = 2
 """Of a command whose input cannot be used."""
@@ -38,6 +41,14 @@ def plain_console(stderr: bool = False) -> Console:
             raise BrokenPipeError  # and not rich's exit with code 1
 
     return PlainConsole(stderr=stderr, highlight=False, soft_wrap=True, markup=False, emoji=False)
+
+
+def photo_bar(photos: Iterable[T], total: int, console: Console) -> Iterable[T]:
+    """A bar over photos that are worked on; none without a terminal, where a finished one leaves an empty line."""
+    from rich.progress import track
+
+    hidden = not console.is_terminal
+    return track(photos, "Photos", total=total, console=console, transient=True, disable=hidden)
 
 
 def refusal(error: BaseException) -> InputError | None:

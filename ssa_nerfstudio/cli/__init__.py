@@ -57,8 +57,7 @@ def run_script(command: type) -> None:
     """Run a script that is no command of `ssa` as if it were one: the same options, errors and exit codes.
 
     Args:
-        command: a dataclass with a method `run`; its docstring is the first line of --help, and the types of its fields
-            may state bounds (`option_bounds`).
+        command: a dataclass with a method `run`; its docstring is the first line of --help.
     """
     import inspect
 
@@ -67,7 +66,7 @@ def run_script(command: type) -> None:
     program = f"python {sys.argv[0]}"
     with termination.as_ctrl_c(), _errors_in_one_line(program):
         read = arguments.read(command, sys.argv[1:], program, inspect.getdoc(command) or "")
-        option_bounds.check(read)
+        option_bounds.require_values(read)
         read.run()
 
 

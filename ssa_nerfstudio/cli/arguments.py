@@ -15,6 +15,7 @@ from typing import Any, TypeVar, Union, get_args, get_origin
 import tyro
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
+from ssa_nerfstudio.cli import option_bounds
 from ssa_nerfstudio.errors import InputError
 
 T = TypeVar("T")
@@ -78,8 +79,8 @@ def read(command: type[T], arguments: list[str], program: str, description: str,
         defaults: `default`, an instance whose values hold where no option is given.
 
     Raises:
-        InputError: an option is unknown, missing, or has a value that it does not take; or --output is -, which would
-            be the name of a folder or file.
+        InputError: an option is unknown, missing, or has a value that it does not take, of a flat command also one out
+            of bounds (`option_bounds`); or --output is -, which would be the name of a folder or file.
         SystemExit: of code 0, after --help.
     """
     report = io.StringIO()
@@ -96,6 +97,8 @@ def read(command: type[T], arguments: list[str], program: str, description: str,
         if getattr(made, name, None) == STANDARD_OUTPUT:
             option = name.replace("_", "-")
             raise InputError(f"--{option} -: {program} does not write to the standard output", "name a place on a disk")
+    if not defaults:
+        option_bounds.check(made)
     return made
 
 

@@ -16,6 +16,7 @@ from ssa_nerfstudio._system import ctrl_c
 from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.cli.option_bounds import Count
 from ssa_nerfstudio.errors import InputError, TrainingError
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Command:
     time_limit: float | None = None
     """Minutes: no run is started that would not end in time, what still runs then is stopped, and what is left is
     said. Call again to go on."""
-    runs_per_device: int = 1
+    runs_per_device: Count = 1
     """Runs that share a GPU (or the CPU) at a time; above 1 their seconds count for no frontier."""
     scheduler: str | None = None
     """Address of a dask.distributed scheduler; its workers must see --output under the same path."""
@@ -52,7 +53,7 @@ class Command:
     """Keep config.yml and checkpoint of every training in models/, for ns-viewer and ns-export."""
     list: bool = False
     """Print the ids of the runs, and which are done, and stop."""
-    threads: int = field(default_factory=usable_cores)
+    threads: Count = field(default_factory=usable_cores)
     """Photos worked on at once while datasets are made."""
 
     def run(self) -> None:
@@ -83,9 +84,6 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
     from ssa_nerfstudio.experiments.benchmark.report.benchmark_report import store_plan
     from ssa_nerfstudio.experiments.benchmark.results import Result, merge, read_all
 
-    for option in ("runs_per_device", "threads"):
-        if getattr(command, option) < 1:
-            raise InputError(f"--{option.replace('_', '-')} must be at least 1, got {getattr(command, option)}")
     if command.time_limit is not None and not 0 < command.time_limit < math.inf:
         raise InputError(f"--time-limit must be a positive number of minutes, got {command.time_limit:g}")
     runs = bench.select(planned, command.scenes, command.only)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ssa_nerfstudio._system import termination
 from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.cli.option_bounds import Bound, Count
 from ssa_nerfstudio.errors import InputError
 
 
@@ -21,9 +23,9 @@ class Command:
     """Folder for report.html, sheet.png, results.json, the datasets and the trained models."""
     data: Path | None = None
     """A nerfstudio dataset to show instead of the built-in scene; trained as it is, no artifact is added."""
-    steps: int = 800
+    steps: Count = 800
     """Training steps of each run; schedules are scaled to it. Photos of megapixels need thousands and a GPU."""
-    scale_factor: float = 1.0
+    scale_factor: Annotated[float, Bound("in (0, 1]", lambda value: 0 < value <= 1)] = 1.0
     """Photos of --data are resized by this, in (0, 1]."""
 
     def run(self) -> None:
@@ -32,10 +34,6 @@ class Command:
         Raises:
             SSAError: an option or the dataset cannot be used, or a training cannot continue.
         """
-        if self.steps < 1:
-            raise InputError(f"--steps must be at least 1, got {self.steps}")
-        if not 0 < self.scale_factor <= 1:
-            raise InputError(f"--scale-factor must be in (0, 1], got {self.scale_factor:g}")
         if self.data is None and self.scale_factor != 1:
             raise InputError("--scale-factor is for the photos of --data", "add --data, or leave it out")
         if self.data is not None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.cli.arguments import STANDARD_OUTPUT
+from ssa_nerfstudio.cli.option_bounds import Count, at_least
 from ssa_nerfstudio.errors import InputError
 
 _MAX_DRAWS = 100_000
@@ -27,11 +29,11 @@ class Command:
     json: Path | None = None
     """File to write verdict, coverage, p_value, views and more of each camera to; must not exist. -: the standard
     output, and what else is said goes to the error stream."""
-    draws: int = 200
+    draws: Annotated[int, at_least(200)] = 200
     """Number of captures of randomly shifted views to compare with, from 200 to 100000."""
-    frames: int = 200
+    frames: Annotated[int, at_least(2)] = 200
     """Number of frames to take from videos."""
-    threads: int = field(default_factory=usable_cores)
+    threads: Count = field(default_factory=usable_cores)
     """Number of photos decoded at once."""
 
     def check(self) -> None:
@@ -40,9 +42,6 @@ class Command:
         Raises:
             InputError: one cannot be used.
         """
-        for name, lowest in (("draws", 200), ("frames", 2), ("threads", 1)):
-            if (value := getattr(self, name)) < lowest:
-                raise InputError(f"--{name} must be at least {lowest}, got {value}")
         if self.draws > _MAX_DRAWS:
             raise InputError(f"--draws must be at most {_MAX_DRAWS}, got {self.draws}")
         file = None if self.json == STANDARD_OUTPUT else self.json

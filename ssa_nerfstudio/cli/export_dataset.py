@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from ssa_nerfstudio._system.counted_noun import counted
-from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio._system.terminal_messages import photo_bar, plain_console
+from ssa_nerfstudio.cli.option_bounds import Share
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ class Command:
     original photos, holes for cleaned ones."""
     frame: Literal["auto", "raw", "undistorted"] = "auto"
     """Photos with or without the lens' distortion; auto: what the program takes best."""
-    threshold: float = 0.5
+    threshold: Share = 0.5
     """Matte above which a pixel is artifact, in (0, 1); needs --load-config."""
     downscale_factor: int = 1
     """N > 1 reads images_N."""
@@ -49,8 +50,6 @@ class Command:
         Raises:
             InputError: an option, the checkpoint or a photo cannot be used.
         """
-        if not 0 < self.threshold < 1:
-            raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")
         if self.load_config is None and self.data is None:
             raise InputError("there is nothing to export", "give --load-config of a run, or --data of a dataset")
         for option, asked in (
@@ -62,7 +61,6 @@ class Command:
                 raise InputError(f"{option} takes the overlay of a run", "add --load-config")
         if self.output.exists():
             raise InputError(f"{self.output} exists already", "remove it or choose another --output")
-        from rich.progress import track
 
         from ssa_nerfstudio.data.dataset import Dataset
         from ssa_nerfstudio.data.writing import staged_folder
@@ -75,9 +73,7 @@ class Command:
         artifact = self._artifact(dataset, data)
         export = DatasetExport(dataset, artifact, self.program, self.photos, self.masks, self.frame)
         with staged_folder(self.output) as folder:
-            # Without a terminal, a finished bar leaves an empty line.
-            bar = {"console": console, "transient": True, "disable": not console.is_terminal}
-            photos = list(track(export.write_photos(folder), "Photos", total=len(export.views), **bar))
+            photos = list(photo_bar(export.write_photos(folder), len(export.views), console))
             export.write_poses(folder, photos)
         left = sum(photo.left for photo in photos) / len(photos)
         console.print(

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ssa_nerfstudio._system.counted_noun import counted
-from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio._system.terminal_messages import photo_bar, plain_console
+from ssa_nerfstudio.cli.option_bounds import Share
 from ssa_nerfstudio.errors import InputError
 
 
@@ -26,7 +27,7 @@ class Command:
     """Put the overlays of a 360 degree capture's faces together, in the frame of its equirectangular photos."""
     data: Path | None = None
     """For --equirectangular: the dataset that the run was trained on, where it has moved."""
-    threshold: float = 0.5
+    threshold: Share = 0.5
     """Matte above which a pixel is artifact in the masks and in restored photos, in (0, 1). For structure from motion
     0.2 is safer."""
     step: int | None = None
@@ -45,15 +46,12 @@ class Command:
         Raises:
             InputError: an option, the checkpoint or a photo cannot be used.
         """
-        if not 0 < self.threshold < 1:
-            raise InputError(f"--threshold must be in (0, 1), got {self.threshold:g}")
         if self.camera is not None and self.apply is None:
             raise InputError("--camera chooses the camera of --apply", "add --apply PHOTOS")
         if self.equirectangular and (self.raw_frame or self.camera is not None):
             raise InputError("--equirectangular has one frame and one camera", "leave --raw-frame and --camera out")
         if self.data is not None and not self.equirectangular:
             raise InputError("--data is for --equirectangular", "leave it out")
-        from rich.progress import track
 
         from ssa_nerfstudio.data.writing import staged_folder
         from ssa_nerfstudio.export.artifact_files import write_overlay
@@ -90,9 +88,7 @@ class Command:
             written = write_overlay(folder, checkpoint, raw if self.raw_frame else undistorted, self.threshold)
             write_exposure(checkpoint, folder)
             photos_done = restore_photos(self.apply or folder, photos, frames, folder, self.threshold)
-            # Without a terminal, a finished bar leaves an empty line.
-            bar = {"console": console, "transient": True, "disable": not console.is_terminal}
-            written_photos = list(track(photos_done, "Photos", total=len(photos), **bar))
+            written_photos = list(photo_bar(photos_done, len(photos), console))
             recovered = [photo for photo in written_photos if photo.shows]
             if photos and not recovered:
                 raise InputError(

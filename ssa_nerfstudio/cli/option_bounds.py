@@ -1,4 +1,4 @@
-"""What the values of a script's options may be, as their types state it: `rounds: Count`, `scale_factor: Factor`."""
+"""What the values of a command's options may be, as their types state it: `rounds: Count`, `scale_factor: Factor`."""
 
 from __future__ import annotations
 
@@ -46,28 +46,42 @@ Count = Annotated[int, at_least(1)]
 """As of steps."""
 Factor = Annotated[float, Bound("above 0 and finite", lambda value: 0 < value < math.inf)]
 """By which something is resized."""
+Share = Annotated[float, Bound("in (0, 1)", lambda value: 0 < value < 1)]
+"""As of thresholds of a matte."""
 Method = Literal["ssa-splatfacto", "ssa-splatfacto-fast", "ssa-splatfacto-mcmc", "ssa-splatfacto-paper"]
 """nerfstudio's names of this plugin's methods."""
 
 
 def check(command: Any) -> None:
-    """Refuse values out of bounds, and options of several values that have none, though by default they have some.
+    """Refuse values out of bounds.
 
     Args:
         command: a dataclass of options, read from the command line.
 
     Raises:
-        InputError: a value is out of its bounds, or missing.
+        InputError: a value is out of its bounds.
     """
     hints = get_type_hints(type(command), include_extras=True)
     for field in dataclasses.fields(command):
         hint, value = hints[field.name], getattr(command, field.name)
         marks = getattr(hint, "__metadata__", ())
         option = field.name.upper() if tyro.conf.Positional in marks else f"--{field.name.replace('_', '-')}"
-        if value == () != field.default:
-            raise InputError(f"{option} has no value", "give it at least one")
         # Of `Annotated[int, ...]` the bounds are its own, of `tuple[Annotated[int, ...], ...]` and the like a part's.
         bounds = [mark for part in (hint, *get_args(hint)) for mark in getattr(part, "__metadata__", ())]
         for each in value if isinstance(value, tuple) else [] if value is None else [value]:
             for bound in [bound for bound in bounds if isinstance(bound, Bound) and not bound.holds(each)]:
                 raise InputError(f"{option} must be {bound.words}, got {each}")
+
+
+def require_values(command: Any) -> None:
+    """Refuse options of several values that have none, though by default they have some.
+
+    Args:
+        command: as for `check`.
+
+    Raises:
+        InputError: an option has no value.
+    """
+    for field in dataclasses.fields(command):
+        if getattr(command, field.name) == () != field.default:
+            raise InputError(f"--{field.name.replace('_', '-')} has no value", "give it at least one")

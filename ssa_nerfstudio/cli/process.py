@@ -8,13 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.name_list import name_list
 from ssa_nerfstudio._system.terminal_messages import plain_console
 from ssa_nerfstudio.cameras.projections import FaceName, Projection
+from ssa_nerfstudio.cli.option_bounds import at_least
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
@@ -48,7 +49,7 @@ class Command:
     detect: bool = False
     """Detect an opaque artifact (see ssa detect) and mask it, where --mask is not given. Semi-transparent artifacts are
     never masked: the scene behind them would be lost, too."""
-    frames: int = 200
+    frames: Annotated[int, at_least(3)] = 200
     """Frames to take from the videos of each pass: evenly spaced, the sharpest of their neighborhood."""
     min_registered: float = 0.5
     """Stop when less than this share of a pass's photos is registered; 0: when none is."""
@@ -65,7 +66,7 @@ class Command:
     where they have one; the dataset's photos stay as they are."""
     filter_stationary: bool = True
     """Drop matches at the same place of both frames: they are on the artifact."""
-    max_image_size: int = 1600
+    max_image_size: Annotated[int, at_least(64)] = 1600
     """Longest side of the photos in which features are extracted, pixels; the dataset's photos keep their size."""
     threads: int = -1
     """Number of threads; -1: one per core."""
@@ -88,9 +89,6 @@ class Command:
         from ssa_nerfstudio.sfm.photos_to_dataset import process
         from ssa_nerfstudio.sfm.reconstruction import SfmSettings
 
-        for name, lowest in (("frames", 3), ("max_image_size", 64)):
-            if (value := getattr(self, name)) < lowest:
-                raise InputError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
         if not 0 <= self.min_registered <= 1:
             raise InputError(f"--min-registered is a share of the photos, from 0 to 1, got {self.min_registered}")
         if self.threads < 1 and self.threads != -1:

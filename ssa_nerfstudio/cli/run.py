@@ -13,6 +13,7 @@ import tyro
 
 from ssa_nerfstudio._system import ctrl_c, termination
 from ssa_nerfstudio.cli import arguments
+from ssa_nerfstudio.cli.option_bounds import at_least
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ class Command:
         "ssa-splatfacto"
     )
     """What to train; -fast: ssa-splatfacto in fewer steps, with ADC in place of MCMC, as without a GPU."""
-    steps: int | None = None
+    steps: Annotated[int | None, at_least(1)] = None
     """Training steps; schedules are scaled to them. Default: 15000 with a GPU (4000 for -fast, 30000 for -paper),
     2000 without."""
     forwarded: tyro.conf.Suppress[tuple[tuple[str, ...], ...]] = ((),) * len(STAGES)
@@ -100,8 +101,6 @@ class Command:
         from ssa_nerfstudio._system.file_lock import locked_folder
         from ssa_nerfstudio.data.writing import write_text
 
-        if self.steps is not None and self.steps < 1:
-            raise InputError(f"--steps must be at least 1, got {self.steps}")
         console = Console(highlight=False, soft_wrap=True)
         console.print("Loading nerfstudio ...")
         with termination.ended_at_once("ssa run"):

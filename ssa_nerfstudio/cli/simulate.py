@@ -6,10 +6,12 @@ import dataclasses
 import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 from ssa_nerfstudio._system.cores import usable_cores
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import plain_console
+from ssa_nerfstudio.cli.option_bounds import Count, at_least
 from ssa_nerfstudio.errors import InputError
 
 
@@ -26,16 +28,16 @@ class Command:
     by name, or .yaml files. `--effects` without a value copies the dataset and adds the split."""
     scene: str | None = None
     """A scene instead: name or .yaml file; the scene.yaml of an earlier run repeats its effects."""
-    seed: int | None = None
+    seed: Annotated[int | None, at_least(0)] = None
     """Decides everything random, not negative; by default the scene's own, or 0."""
     exposure: float | None = None
     """Each training photo gets a gain and an offset of its own: standard deviation of the gains' logarithm, in [0, 1];
     by default the scene's own, or 0. It acts on what is on the lens, and not on what software drew (watermark, ui)."""
-    eval_interval: int = 8
+    eval_interval: Annotated[int, at_least(2)] = 8
     """One photo in so many, in sorted order, is for testing; ignored where transforms.json has a split."""
-    downscale_factor: int = 1
+    downscale_factor: Count = 1
     """Read the photos from images_N and write a dataset of that size."""
-    threads: int = field(default_factory=usable_cores)
+    threads: Count = field(default_factory=usable_cores)
     """Photos in flight at once."""
 
     def run(self) -> None:
@@ -54,9 +56,6 @@ class Command:
 
         if (self.effects is None) == (self.scene is None):
             raise InputError("give either --effects NAME ... or --scene NAME")
-        for name, lowest in (("seed", 0), ("threads", 1), ("eval_interval", 2), ("downscale_factor", 1)):
-            if (value := getattr(self, name)) is not None and value < lowest:
-                raise InputError(f"--{name.replace('_', '-')} must be at least {lowest}, got {value}")
         if self.data is None and self.downscale_factor != 1:
             raise InputError("--downscale-factor is for the photos of --data", "add --data, or leave it out")
         scene = Scene(read_effects(self.effects)) if self.effects is not None else read_scene(str(self.scene))
