@@ -35,6 +35,10 @@ class ResultsFolder:
         """Folder of a run's pictures."""
         return self.folder / "pictures" / run
 
+    def model(self, run: str) -> Path:
+        """Where a run's config.yml and checkpoint are kept if that is asked for; an absolute path."""
+        return self.folder.resolve() / "models" / run
+
     def log(self, run: str) -> Path:
         """What a run printed."""
         return self.folder / "logs" / f"{run}.log"

@@ -132,7 +132,7 @@ def work(request: Request, revision: str) -> Result:
             write_view_pictures(pipeline, place.pictures(run.id))
             result.status = "finished"
         if request.keep_models:
-            shutil.move(place.running(run.id) / "nerfstudio", place.folder / "models" / run.id)
+            _keep_model(config, place.model(run.id))
     except Exception as error:
         traceback.print_exc()
         result.reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
@@ -140,6 +140,14 @@ def work(request: Request, revision: str) -> Result:
     result.company = {"runs_per_device": request.runs_per_device, "others_share_of_cores": company.share_of_cores()}
     result.ended = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
     return result
+
+
+def _keep_model(config: SSATrainerConfig, folder: Path) -> None:
+    """Move what a training wrote to an absolute path, where nerfstudio finds its checkpoint by the configuration."""
+    shutil.rmtree(folder, ignore_errors=True)  # of an earlier try
+    shutil.move(config.output_dir, folder)
+    config.output_dir = folder
+    config.save_config()
 
 
 def configuration(run: Run, place: ResultsFolder) -> SSATrainerConfig:

@@ -87,7 +87,7 @@ def test_each_one_is_trained_judged_and_timed_like_any_other_method(folder):
 def test_nerfstudio_loads_what_was_trained(folder, method):
     (result,) = (result for result in read_all([folder])[0] if result.run.method == method)
     (config,) = (folder / "models" / result.run.id).rglob("config.yml")
-    pipeline: Any = eval_setup(config, test_mode="inference", update_config_callback=_moved(config))[1]
+    pipeline: Any = eval_setup(config, test_mode="inference")[1]
     camera, _ = pipeline.datamanager.fixed_indices_eval_dataloader[0]
     assert torch.isfinite(pipeline.model.get_outputs_for_camera(camera)["rgb"]).all()
     assert len(pipeline.model.means) == result.gaussians
@@ -149,11 +149,3 @@ def test_exposures_that_a_baseline_would_ignore_are_refused_before_anything_begi
     assert refusal.value.code == 2
     assert "predicts photos without their exposures; set exposure: off for it" in capsys.readouterr().err
     assert not (tmp_path / "results" / "scenes").exists()
-
-
-def _moved(config: Path):
-    def update(stated):
-        stated.output_dir = config.parents[3]
-        return stated
-
-    return update
