@@ -63,7 +63,8 @@ def _add(
     # As hypot: squares of small gradients would be 0.
     larger = tl.maximum(tl.maximum(x, y), 1e-37)
     ratio = tl.minimum(x, y) / larger
-    norm = tl.where(tl.maximum(x, y) > 0, larger * tl.sqrt(1.0 + ratio * ratio), 0.0)
+    total = x + y  # NaN where one of them is: tl.maximum may drop it
+    norm = tl.where(total > 0, larger * tl.sqrt(1.0 + ratio * ratio), total)
     tl.store(gradients + i, tl.load(gradients + i, mask=visible, other=0.0) + half * norm, mask=visible)
     tl.store(counts + i, tl.load(counts + i, mask=visible, other=0.0) + 1.0, mask=visible)
     if SIZES:

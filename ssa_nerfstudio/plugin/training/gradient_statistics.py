@@ -28,8 +28,7 @@ class GradientStatistics:
     ) -> None:
         """Add one view, with zeros for invisible Gaussians: a list of the visible ones would wait for the device.
 
-        One launch where Triton's kernels run; elsewhere ten on CUDA. Gradients that are not finite spoil a sum, but for
-        NaN in Triton's kernel, which may drop it: without guards either is possible.
+        One launch where Triton's kernels run; elsewhere ten on CUDA. Gradients that are not finite spoil a sum.
 
         Args:
             gradients: of the centers [N, 2], pixels.

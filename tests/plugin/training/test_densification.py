@@ -84,6 +84,9 @@ def views():
         gradients[0], radii[0] = 0.0, 7
         if taken is not None and not taken:
             gradients[5:9] = float("nan")
+        elif taken is not None:
+            gradients[11, 0], gradients[12, 1], gradients[13, 1] = float("nan"), float("nan"), float("inf")
+            radii[11:14] = 5
         yield gradients, radii, taken
 
 for sizes in (True, False):
@@ -94,7 +97,9 @@ for sizes in (True, False):
         plain.GradientStatistics(*sums[:2], largest[0]).add(gradients, radii, 40, 30, 2, taken)
         add_view(*mine[:2], largest[1], gradients, radii, taken, 40.0, 30 / 40, 1 / 40)
     for name, a, b in zip(("gradients", "counts", "largest"), sums, mine, strict=True):
-        torch.testing.assert_close(b, a, rtol=1e-5, atol=0, msg=lambda text: f"{name}, sizes {sizes}: {text}")
+        say = f"{name}, sizes {sizes}: {{}}".format
+        torch.testing.assert_close(b, a, rtol=1e-5, atol=0, equal_nan=True, msg=say)
+    assert mine[0].isfinite().sum() == 697
 print("equal")
 """
 
