@@ -50,7 +50,7 @@ class Command:
     merge: tuple[Path, ...] = ()
     """Copy the results of these folders first."""
     keep_models: bool = False
-    """Keep config.yml and checkpoint of every training in models/, for ns-viewer and ns-export."""
+    """Keep config.yml and checkpoint of every training that this call does in models/, for ns-viewer and ns-export."""
     list: bool = False
     """Print the ids of the runs, and which are done, and stop."""
     threads: Count = field(default_factory=usable_cores)

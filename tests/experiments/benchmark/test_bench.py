@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 import pytest
+import yaml
 from conftest import at_work
 from made_results import benchmark, folder_of, result
 
@@ -98,6 +99,25 @@ def test_a_run_that_failed_is_done_again(tmp_path):
     folder = folder_of(tmp_path / "out", [result(run, status="failed", reason="the machine caught fire")])
     main(["bench", str(path), "--output", str(folder)])
     assert [each.status for each in read_all([folder])[0]] == ["finished"]
+
+
+def test_a_model_that_cannot_be_kept_fails_its_run_and_a_kept_one_is_found_by_nerfstudio(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("short.yaml").write_text(SHORT)
+    Path("out").mkdir()
+    Path("out/models").touch()
+    with pytest.raises(SystemExit):
+        main(["bench", "short.yaml", "--output", "out", "--keep-models"])
+    (failed,) = read_all([Path("out")])[0]
+    assert (failed.status, failed.reason.split(":")[0]) == ("failed", "NotADirectoryError")
+    Path("out/models").unlink()
+    main(["bench", "short.yaml", "--output", "out", "--keep-models"])
+    (kept,) = read_all([Path("out")])[0]
+    assert kept.status == "finished"
+    monkeypatch.chdir("/")
+    (path,) = (tmp_path / "out" / "models" / kept.run.id).rglob("config.yml")
+    config = yaml.load(path.read_text(), Loader=yaml.Loader)
+    assert list(config.get_checkpoint_dir().glob("*.ckpt"))
 
 
 def test_results_of_other_folders_are_taken_over(tmp_path, capsys):

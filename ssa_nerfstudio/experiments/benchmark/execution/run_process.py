@@ -118,7 +118,7 @@ def work(request: Request, revision: str) -> Result:
                 region=(region := _region(run, place)),
             )
         except training.Diverged as error:
-            result.status, result.reason = "diverged", str(error)
+            status, result.reason = "diverged", str(error)
         else:
             result.metrics = {**outcome.metrics}
             result.views = {name: {**view} for name, view in outcome.views.items()}
@@ -130,9 +130,10 @@ def work(request: Request, revision: str) -> Result:
             from ssa_nerfstudio.experiments.runs.view_pictures import write_view_pictures
 
             write_view_pictures(pipeline, place.pictures(run.id))
-            result.status = "finished"
+            status = "finished"
         if request.keep_models:
             _keep_model(config, place.model(run.id))
+        result.status = status
     except Exception as error:
         traceback.print_exc()
         result.reason = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
