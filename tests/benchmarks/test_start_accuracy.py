@@ -41,7 +41,10 @@ def test_what_is_not_drawn_on_a_clean_capture_is_an_error(write_built_in_scene, 
     assert row["verdict"] in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("text", ['{"data"', "3", '{"verdict": "none"}'])
+FOREIGN = '{"verdict": "none", "data": [1], "constant": "", "factor": 1}'
+
+
+@pytest.mark.parametrize("text", ['{"data"', "3", "[1, 2]", '{"verdict": "none"}', '{"a": 1}', FOREIGN])
 def test_a_file_of_something_else_is_refused(write_built_in_scene, tmp_path, text):
     clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=64, height=48)
     (tmp_path / "a.jsonl").write_text(text)
