@@ -10,7 +10,7 @@ import tyro
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio._system.terminal_messages import photo_bar, plain_console
-from ssa_nerfstudio.cli.option_bounds import Share
+from ssa_nerfstudio.cli.option_bounds import Count, Share
 from ssa_nerfstudio.errors import InputError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class Command:
     """Photos with or without the lens' distortion; auto: what the program takes best."""
     threshold: Share = 0.5
     """Matte above which a pixel is artifact, in (0, 1); needs --load-config."""
-    downscale_factor: int = 1
+    downscale_factor: Count = 1
     """N > 1 reads images_N."""
 
     def run(self) -> None:

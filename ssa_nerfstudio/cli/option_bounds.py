@@ -70,7 +70,8 @@ def check(command: Any) -> None:
         bounds = [mark for part in (hint, *get_args(hint)) for mark in getattr(part, "__metadata__", ())]
         for each in value if isinstance(value, tuple) else [] if value is None else [value]:
             for bound in [bound for bound in bounds if isinstance(bound, Bound) and not bound.holds(each)]:
-                raise InputError(f"{option} must be {bound.words}, got {each}")
+                shown = f"{each:g}" if isinstance(each, float) else each
+                raise InputError(f"{option} must be {bound.words}, got {shown}")
 
 
 def require_values(command: Any) -> None:
