@@ -81,13 +81,8 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
     results, problems = read_all([place.folder])
     for problem in problems:
         console.print(f"ignored: {problem}", style="yellow", highlight=False, soft_wrap=True)
-    done = {result.run.id for result in results if result.status != "failed"}
-    missing = [run for run in runs if run.id not in done]
-    known = {result.run.training: result for result in results if result.status != "failed"}
-    names: dict[str, list[Run]] = {}  # of each training, in the order of their importance
-    for run in missing:
-        names.setdefault(run.training, []).append(run)
-    todo = _untrained(runs, results)
+    names, known = _outstanding(runs, results)
+    todo = _untrained(names, known)
     prepare(todo, place.scenes, place.artifacts, options.threads, console)
 
     def command(run: Run) -> str:
@@ -98,7 +93,8 @@ def bench(runs: list[Run], place: ResultsFolder, invocation: str, options: Optio
         with console.status("Compiling kernels, in short trainings that are not timed ..."):
             warm_up(todo, place, found[0] if found else None, deadline)
     at_once = max(1, len(found)) * options.runs_per_device
-    with ProgressTable(console, len(runs), len(runs) - len(missing), at_once) as table:
+    done = len(runs) - sum(len(same) for same in names.values())
+    with ProgressTable(console, len(runs), done, at_once) as table:
         estimate = RuntimeEstimate(results)
 
         def ended(run: Run, result: Result | None) -> None:
@@ -131,21 +127,26 @@ def check(runs: list[Run], place: ResultsFolder, merged: tuple[Path, ...] = ()) 
     """
     import distributed  # noqa: F401 - by the runner, after minutes of making datasets
 
-    todo = _untrained(runs, read_all([place.folder, *merged])[0])
+    todo = _untrained(*_outstanding(runs, read_all([place.folder, *merged])[0]))
     for run in todo:
         _check_settings(run, place)
     check_captures(todo, place.scenes, place.artifacts)
 
 
-def _untrained(runs: list[Run], results: list[Result]) -> list[Run]:
-    """Of each training that no run has finished, the first run."""
-    done = {result.run.id for result in results if result.status != "failed"}
-    known = {result.run.training for result in results if result.status != "failed"}
-    first: dict[str, Run] = {}
+def _outstanding(runs: list[Run], results: list[Result]) -> tuple[dict[str, list[Run]], dict[str, Result]]:
+    """Runs without a result, by their training and in the order of their importance; and a result of each training."""
+    there = [result for result in results if result.status != "failed"]
+    done, known = {result.run.id for result in there}, {result.run.training: result for result in there}
+    names: dict[str, list[Run]] = {}
     for run in runs:
-        if run.id not in done and run.training not in known:
-            first.setdefault(run.training, run)
-    return list(first.values())
+        if run.id not in done:
+            names.setdefault(run.training, []).append(run)
+    return names, known
+
+
+def _untrained(names: dict[str, list[Run]], known: dict[str, Result]) -> list[Run]:
+    """Of each training that has no result, the most important run."""
+    return [same[0] for training, same in names.items() if training not in known]
 
 
 def _check_settings(run: Run, place: ResultsFolder) -> None:
