@@ -146,6 +146,8 @@ def work(request: Request, revision: str) -> Result:
 def _keep_model(config: SSATrainerConfig, folder: Path) -> None:
     """Move what a training wrote to an absolute path, where nerfstudio finds its checkpoint by the configuration."""
     shutil.rmtree(folder, ignore_errors=True)  # of an earlier try
+    with contextlib.suppress(FileExistsError):  # without a parent the move is a copy; a file in the way ends it
+        folder.parent.mkdir()
     shutil.move(config.output_dir, folder)
     config.output_dir = folder
     config.save_config()
