@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import Parameter
 
+from ssa_nerfstudio.evidence.distant_points import DistantPoints
 from ssa_nerfstudio.overlay.compositing import clip_straight_through, composite
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.artifacts import Artifacts
@@ -28,7 +29,7 @@ from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.regularizers import regularizers
 from ssa_nerfstudio.plugin.training.scene_brightness import clear_the_clearest
-from ssa_nerfstudio.plugin.training.seed_points import color_parameters, outside_cameras
+from ssa_nerfstudio.plugin.training.seed_points import color_parameters, distant_gaussians, outside_cameras
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
@@ -126,6 +127,13 @@ class SSASplatfactoModel(PhotoLosses):
         if self.config.guards and not outside.all():
             for name, values in self.gauss_params.items():
                 self.gauss_params[name] = Parameter(values.data[outside])
+
+    @torch.no_grad()
+    def add_seeds(self, seeds: DistantPoints) -> None:
+        """Add Gaussians that are as large as the points' spacing; call it before the optimizers are built."""
+        new = distant_gaussians(seeds, self.gauss_params, self.config.sh_degree)
+        for name, values in self.gauss_params.items():
+            self.gauss_params[name] = Parameter(torch.cat([values.data, new[name]]))
 
     def step_post_backward(self, step: int) -> None:
         """After the optimizers' step: clamp parameters, then densify."""

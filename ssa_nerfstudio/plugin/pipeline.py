@@ -23,6 +23,7 @@ from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence.distant_points import distant_points
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, fisheye_lenses, group_cameras
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
@@ -32,7 +33,7 @@ from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
-from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
+from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays, views_of
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.densification import gaussian_budget
@@ -111,8 +112,24 @@ class SSAPipeline(VanillaPipeline):
             by_photos = self.config.model.exposure_place == "auto"
             start_beside_artifact(self.model.exposure, self.model.artifacts, samples, by_photos)
         self._set_near_plane()
+        self._add_distant_seeds(photos)
         self._set_budget()
         self.model.examine(self.datamanager)
+
+    def _add_distant_seeds(self, photos: list[dict[str, Any]]) -> None:
+        """Where an overlay is trained, and nothing is resumed: an overlay learns faster than splats that must grow."""
+        config, points, artifacts = self.config.model, self._points(), self.model.artifacts
+        wanted = config.distant_seeds and config.overlay_start == "points" and not config.random_init
+        if not wanted or self.config.artifacts_of or not len(artifacts) or points is None or not len(points):
+            return
+        cameras, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
+        views = views_of(photos, cameras, None if exposure is None else exposure.transforms.detach()[:, 0].exp())
+        with torch.no_grad():
+            own = [artifacts.of_view(view) for view in range(len(views))]
+            layers = [None if overlay is None else overlay.layers() for overlay in own]
+            seeds = distant_points(points.to(views[0].image.device), views, layers)
+        if len(seeds.positions):
+            self.model.add_seeds(seeds)
 
     def _set_budget(self) -> None:
         config, cameras = self.config.model, self.datamanager.train_dataset.cameras

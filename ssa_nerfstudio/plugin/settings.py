@@ -57,6 +57,10 @@ class ModelSettings(SplatfactoModelConfig):
     ignore_changing: bool = True
     """Where the estimate from points finds an artifact that changes from photo to photo, such as a weapon that sways,
     the photos teach the scene nothing; False: they do."""
+    distant_seeds: bool = True
+    """Where an overlay is trained with overlay_start "points", or given: start also from Gaussians far away in
+    directions in which structure from motion has found no points, such as a sky, and the photos agree on a color;
+    False: from its points alone."""
     strategy: Literal["auto", "adc", "mcmc"] = "auto"
     """Densification. adc: adaptive density control, splatfacto's; mcmc: up to a fixed number of Gaussians, cap_max;
     auto: mcmc where at least 7,000 steps are trained, adc in shorter trainings, where it is mostly ahead; a resumed run

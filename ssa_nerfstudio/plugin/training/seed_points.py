@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import torch
 from nerfstudio.models.splatfacto import RGB2SH
 from torch import Tensor
+from torch.nn import ParameterDict
 
+from ssa_nerfstudio.evidence.distant_points import DistantPoints
 from ssa_nerfstudio.evidence.point_samples import project, regular_subset
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
@@ -54,6 +57,24 @@ def outside_cameras(means: Tensor, positions: Tensor) -> Tensor:
 
 
 def color_parameters(colors: Tensor, sh_degree: int) -> Tensor:
-    """Constant spherical harmonics, or logits without harmonics, [N, 3] of colors [N, 3] uint8."""
-    values = colors.float() / 255.0
+    """Constant spherical harmonics, or logits without harmonics, [N, 3] of colors [N, 3] uint8, or float in [0, 1]."""
+    values = colors if colors.is_floating_point() else colors.float() / 255.0
     return RGB2SH(values) if sh_degree > 0 else torch.logit(values, eps=1e-6)
+
+
+def distant_gaussians(seeds: DistantPoints, others: ParameterDict, sh_degree: int) -> dict[str, Tensor]:
+    """Parameters of Gaussians at distant points, round, and as opaque as the first of the other Gaussians.
+
+    Args:
+        seeds: N points.
+        others: the model's Gaussians, at least one.
+        sh_degree: the model's degree of spherical harmonics.
+    """
+    count = len(seeds.positions)
+    new = {name: values.data.new_zeros(count, *values.shape[1:]) for name, values in others.items()}
+    new["means"].copy_(seeds.positions)
+    new["scales"].fill_(math.log(seeds.spacing))
+    new["quats"][:, 0] = 1
+    new["features_dc"].copy_(color_parameters(seeds.colors, sh_degree))
+    new["opacities"].copy_(others["opacities"].data[:1].expand(count, 1))
+    return new

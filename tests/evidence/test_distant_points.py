@@ -1,0 +1,106 @@
+"""What is far away where no point is: cameras that turn before a sky, a ground of points, and artifacts."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.distant_points import DistantPoints, distant_points
+from ssa_nerfstudio.evidence.point_samples import View
+
+HEIGHT, WIDTH = 60, 80
+K = torch.tensor([[70.0, 0.0, 40.0], [0.0, 70.0, 30.0], [0.0, 0.0, 1.0]])
+SIGHT = [None] * 7
+"""Layers of seven views without an artifact."""
+GROUND = torch.cartesian_prod(torch.linspace(-9, 9, 300), torch.tensor([1.0]), torch.linspace(1, 20, 500))
+"""A plane below the cameras (y is down), dense in the frame's lower half."""
+
+
+def sky(direction: Tensor) -> Tensor:
+    """Color [..., 3] in [0, 1] that changes by a tenth over 4 degrees or so."""
+    turn = torch.atan2(direction[..., 0], direction[..., 2])
+    return torch.stack([0.5 + 0.4 * (12 * turn).sin(), 0.5 + 0.3 * (9 * turn).cos(), 0.4 + 0 * turn], dim=-1)
+
+
+def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = False) -> list[View]:
+    """Seven cameras that go forward and turn by 12 degrees; a still picture stands in the frame instead of the sky."""
+    x, y = torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5
+    rays = torch.stack([*torch.meshgrid(y, x, indexing="ij"), torch.ones(HEIGHT, WIDTH)], dim=-1)[..., [1, 0, 2]]
+    rays = rays @ torch.linalg.inv(K).T
+    views = []
+    for number in range(7):
+        angle = math.radians(2 * number - 6)
+        turn = torch.tensor(
+            [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]],
+            dtype=torch.float32,
+        )
+        pose = torch.eye(4)
+        pose[:3, :3], pose[2, 3] = turn, -0.1 * number
+        photo = sky(rays if still else rays @ turn)
+        if artifact is not None:
+            photo = artifact[0] * photo + artifact[1]
+        views.append(View(photo, None, pose, K))
+    return views
+
+
+def errors(found: DistantPoints) -> Tensor:
+    """[N]: of the points' colors against the sky's, seen from the cameras' mean."""
+    center = torch.stack([-(v.world_to_camera[:3, :3].T @ v.world_to_camera[:3, 3]) for v in turning_views()]).mean(0)
+    return (found.colors - sky(found.positions - center)).abs().amax(dim=-1)
+
+
+def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
+    found = distant_points(GROUND, turning_views(), SIGHT)
+    assert len(found.positions) > 200
+    down = found.positions[:, 1] / found.positions.norm(dim=-1)
+    assert down.max() < 0.1, "below the horizon the ground has points of its own"
+    assert errors(found).mean() < 0.03
+    distances = found.positions.norm(dim=-1)
+    assert distances.min() > 2 * GROUND.norm(dim=-1).max()
+    nearest = torch.cdist(found.positions, found.positions).fill_diagonal_(math.inf).amin(dim=1)
+    assert nearest.median() == pytest.approx(found.spacing, rel=0.2)
+
+
+def test_a_picture_that_stands_still_in_the_frame_is_not_far_away() -> None:
+    sky_seeds = len(distant_points(GROUND, turning_views(), SIGHT).positions)
+    assert len(distant_points(GROUND, turning_views(still=True), SIGHT).positions) < 0.1 * sky_seeds
+
+
+def test_colors_are_those_behind_a_film_and_nothing_is_taken_from_what_hides() -> None:
+    T, B = torch.full((HEIGHT, WIDTH, 1), 0.7), torch.full((HEIGHT, WIDTH, 3), 0.2)
+    film = distant_points(GROUND, turning_views((T, B)), [(T, B)] * 7)
+    assert errors(film).mean() < 0.03
+    hiding = torch.where(torch.arange(WIDTH)[:, None] < 30, 0.02, 1.0).expand(HEIGHT, WIDTH, 1)
+    panel = (hiding, (1 - hiding) * torch.tensor([0.9, 0.1, 0.1]))
+    found = distant_points(GROUND, turning_views(panel), [panel] * 7)
+    assert len(found.positions) > 100
+    assert errors(found).mean() < 0.03
+
+
+def test_masked_pixels_and_gains_count() -> None:
+    plain = distant_points(GROUND, turning_views(), SIGHT)
+    gain = torch.tensor([0.5, 0.8, 1.0])
+    views = [View((v.image * gain * 65535).to(torch.int32).to(torch.uint16), None, v.world_to_camera, K, gain)
+             for v in turning_views()]  # fmt: skip
+    assert torch.allclose(distant_points(GROUND, views, SIGHT).colors, plain.colors, atol=1e-3)
+    nothing = [View(v.image, torch.zeros(HEIGHT, WIDTH), v.world_to_camera, K) for v in views]
+    assert not len(distant_points(GROUND, nothing, SIGHT).positions)
+
+
+def test_two_views_are_too_few() -> None:
+    assert not len(distant_points(GROUND, turning_views()[:2], SIGHT[:2]).positions)
+
+
+def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
+    views = turning_views()
+    small = torch.tensor([[0.5], [0.5], [1.0]]) * K
+    halves = [
+        View(v.image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(dim=(1, 3)), None, v.world_to_camera, small)
+        for v in views[1::2]
+    ]
+    found = distant_points(GROUND, [*views[::2], *halves], SIGHT)
+    assert len(found.positions) > 100
+    assert errors(found).mean() < 0.05
