@@ -1,4 +1,4 @@
-"""Points of the scene far away where structure from motion found none: a sky, clouds, whatever is behind everything.
+"""Points of the scene far away where structure from motion found none: a sky, clouds, distant hills.
 
 A scene starts from its points, an overlay at every pixel. Where there are no points, splats must first grow into the
 frame, and meanwhile the overlay learns what they do not show: on a walk a sky hardly moves in the frame.
@@ -10,7 +10,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
@@ -30,6 +34,8 @@ MAX_DIRECTIONS = 2**18
 """Of the whole sphere; a telephoto lens, whose pixels are smaller, has a larger spacing."""
 DISTANCE = 3.0
 """Of the distant points, relative to that of the 99th percentile of the scene's points, from the cameras' mean."""
+NEARER = (0.5, 0.9, 0.99)
+"""Quantiles of the scene's points whose distances are the alternatives: there are the scene's surfaces."""
 MIN_SIGHTS = 3
 """Views that must see a direction: the fewest of which a median leaves one out."""
 MAX_VIEWS = 128
@@ -56,9 +62,11 @@ def distant_points(
 ) -> DistantPoints:
     """Find directions in which the photos show something far away, and no point is seen.
 
-    A direction counts if most of the views that have it in their frames see none of the scene's points around it, and
-    if one color for it explains these photos at least as well as one color for each of their pixels does: what has
-    parallax is not far, and what stands still in the frame is an artifact.
+    A direction is a candidate if most of the views that show it see none of the scene's points around it, and if one
+    color for it explains these photos at least as well as one color for each of their pixels does: what stands still in
+    the frame is an artifact. A connected area of candidates is far away if that explains its photos better than any
+    distance does at which the scene has its points: what is nearer has parallax. What the artifact hides from all views
+    continues what is seen nearest to it.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
@@ -70,69 +78,84 @@ def distant_points(
     """
     every = -(-len(views) // MAX_VIEWS)
     views, layers = views[::every], layers[::every]
-    poses, lenses = torch.stack([v.world_to_camera for v in views]), torch.stack([v.intrinsics for v in views])
-    center = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].mean(dim=0).to(points)
     points = regular_subset(points, len(views))
-    distance = DISTANCE * float((points - center).norm(dim=1).kthvalue(math.ceil(0.99 * len(points))).values)
-    reductions = [working_reduction(*view.image.shape[:2]) for view in views]
-    angles = [reduction / float(lens[0, 0]) for reduction, lens in zip(reductions, lenses, strict=True)]
+    poses = torch.stack([view.world_to_camera for view in views])
+    center = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].mean(dim=0).to(points)
+    distances = (points - center).norm(dim=1)
+    nearer = [float(distances.kthvalue(math.ceil(share * len(points))).values) for share in NEARER]
+    radius = DISTANCE * nearer[-1]
+    scenes = [_scene_in(view, of_artifact) for view, of_artifact in zip(views, layers, strict=True)]
+    angles = [scene.reduction / float(view.intrinsics[0, 0]) for scene, view in zip(scenes, views, strict=True)]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
-    sphere = center + distance * _directions(round(4 * math.pi / angle**2)).to(points)
-    means = _Means()
-    seen = []
-    for number, (view, of_artifact) in enumerate(zip(views, layers, strict=True)):
-        photo, shown = _scene_in(view, of_artifact, reductions[number])
-        means.add(photo, shown)
-        seen.append(_sights(sphere, points, view, photo, shown, reductions[number]))
-    direction, color, free = (
-        torch.cat(each) for each in zip(*((s.direction, s.color, s.free) for s in seen), strict=True)
-    )
-    static = torch.cat([means.of(s.size)[s.pixel] for s in seen])
-    in_frames = torch.bincount(direction, minlength=len(sphere))
-    direction, color, static = direction[free], color[free], static[free]
-    color, direction, static = _by_direction(color, direction, static)
-    sights = torch.bincount(direction, minlength=len(sphere))
-    first = sights.cumsum(0) - sights
-    median = color[(first + sights // 2).clamp_max(max(0, len(color) - 1))] if len(color) else sphere.new_zeros(0, 3)
-    enough = (sights >= MIN_SIGHTS) & (2 * sights >= in_frames)
-    if not enough.any():
-        return DistantPoints(sphere[:0], sphere[:0], distance * angle)
-    residuals = torch.stack([(color - other).abs().sum(dim=-1) for other in (median[direction], static)], dim=-1)
-    far, still = summed(direction, residuals, len(sphere)).unbind(dim=-1)
-    kept = enough & (far <= still)
-    return DistantPoints(sphere[kept], median[kept], distance * angle)
+    directions = _directions(round(4 * math.pi / angle**2)).to(points)
+    taken = [_near_points(points, view, scene) for view, scene in zip(views, scenes, strict=True)]
+    far = _explanation(center + radius * directions, views, scenes, taken)
+    shown = far.shown >= MIN_SIGHTS
+    likely = shown & (far.sights >= MIN_SIGHTS) & (2 * far.sights >= far.shown) & (far.residual <= far.still)
+    candidates = likely.nonzero()[:, 0]
+    if not len(candidates):
+        return DistantPoints(directions[:0], directions[:0], radius * angle)
+    alternatives = [_explanation(center + at * directions[candidates], views, scenes, taken) for at in nearer]
+    area = _connected(directions[candidates], 1.5 * angle)
+    count = int(area.max()) + 1
+    comparable = torch.stack([other.sights >= MIN_SIGHTS for other in alternatives]).all(dim=0)
+    residuals = torch.stack([far.residual[candidates], *(other.residual for other in alternatives)], dim=-1)
+    of_area = summed(area, torch.where(comparable[:, None], residuals, 0), count)
+    distant = (of_area[:, :1] < of_area[:, 1:]).all(dim=1)[area]
+    found = torch.zeros_like(shown)
+    found[candidates[distant]] = True
+    colors = far.median
+    hidden = ((far.in_frame >= MIN_SIGHTS) & ~shown).nonzero()[:, 0]
+    if found.any() and len(hidden):
+        seen = shown.nonzero()[:, 0]
+        _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[hidden].cpu().numpy())
+        source = seen[torch.from_numpy(np.asarray(nearest)).to(seen)]
+        colors[hidden], found[hidden] = colors[source], found[source]
+    return DistantPoints(center + radius * directions[found], colors[found], radius * angle)
 
 
 @dataclass(frozen=True)
-class _Sights:
-    """M directions in the frame of a view."""
+class _Scene:
+    """What a photo shows of the scene, at the working resolution."""
 
-    direction: Tensor
-    """[M] int64."""
-    pixel: Tensor
-    """[M] int64: working pixel, row by row."""
     color: Tensor
-    """[M, 3]."""
-    free: Tensor
-    """[M] bool: none of the scene's points is near, and the pixel shows the scene."""
-    size: tuple[int, int]
-    """Height and width of the working frame."""
+    """[h, w, 3]."""
+    shown: Tensor
+    """[h, w, 1] bool: no mask and no opaque artifact is there."""
+    reduction: int
+    """Photo pixels a working pixel."""
+
+
+@dataclass(frozen=True)
+class _Explanation:
+    """How well points of one color each explain the photos."""
+
+    median: Tensor
+    """[N, 3]: their colors."""
+    residual: Tensor
+    """[N]: mean absolute difference of the photos from it."""
+    still: Tensor
+    """[N]: that from one color for each pixel, the photos' mean."""
+    sights: Tensor
+    """[N] int64: views that show a point, and none of the scene's points near it: those that count."""
+    shown: Tensor
+    """[N] int64: views that show a point."""
+    in_frame: Tensor
+    """[N] int64: views with a point in the frame."""
 
 
 class _Means:
     """Mean over the photos of one size, pixel by pixel, for each size."""
 
-    def __init__(self) -> None:
-        self._sums: dict[tuple[int, int], Tensor] = {}
+    def __init__(self, scenes: Sequence[_Scene]) -> None:
+        self._sums: dict[torch.Size, Tensor] = {}
+        for scene in scenes:
+            total = torch.cat([scene.color * scene.shown, scene.shown.to(scene.color)], dim=-1)
+            self._sums[scene.shown.shape] = self._sums.get(scene.shown.shape, 0) + total
 
-    def add(self, photo: Tensor, shown: Tensor) -> None:
-        height, width = photo.shape[:2]
-        total = torch.cat([photo * shown, shown.to(photo)], dim=-1)
-        self._sums[height, width] = self._sums.get((height, width), 0) + total
-
-    def of(self, size: tuple[int, int]) -> Tensor:
-        """[h w, 3]."""
-        total = self._sums[size].reshape(-1, 4)
+    def of(self, scene: _Scene) -> Tensor:
+        """[h w, 3], of the photos of a scene's size."""
+        total = self._sums[scene.shown.shape].reshape(-1, 4)
         return total[:, :3] / total[:, 3:].clamp_min(1)
 
 
@@ -144,42 +167,66 @@ def _directions(count: int) -> Tensor:
     return torch.stack([radius * turn.cos(), radius * turn.sin(), height], dim=-1)
 
 
-def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, reduction: int) -> tuple[Tensor, Tensor]:
-    """What a photo shows of the scene, at the working resolution: color [h, w, 3], and where it shows it [h, w, 1]."""
-    device = view.image.device
-    photo = reduced(view.image[..., :3].float(), reduction) / FULL_SCALE.get(view.image.dtype, 1.0)
-    shown = torch.ones_like(photo[..., :1], dtype=torch.bool)
+def _connected(directions: Tensor, angle: float) -> Tensor:
+    """Number of the connected area of each direction [N], of neighbors within an angle (radians)."""
+    pairs = KDTree(directions.cpu().numpy()).query_pairs(angle, output_type="ndarray")
+    linked = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=2 * (len(directions),))
+    return torch.from_numpy(connected_components(linked, directed=False)[1].astype(np.int64)).to(directions.device)
+
+
+def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None) -> _Scene:
+    height, width = view.image.shape[:2]
+    reduction = working_reduction(height, width)
+    color = reduced(view.image[..., :3].float(), reduction) / FULL_SCALE.get(view.image.dtype, 1.0)
+    shown = torch.ones_like(color[..., :1], dtype=torch.bool)
     if view.mask is not None:
-        height, width = view.image.shape[:2]
-        shown &= reduced((view.mask.reshape(height, width, 1) != 0).to(photo), reduction) == 1
+        shown &= reduced((view.mask.reshape(height, width, 1) != 0).to(color), reduction) == 1
     if layers is not None:
-        transmittance, addition = (reduced(layer.to(device), reduction) for layer in layers)
+        transmittance, addition = (reduced(layer.to(color), reduction) for layer in layers)
         transmittance = transmittance.mean(dim=-1, keepdim=True)
         shown &= transmittance >= MIN_SHOWN
-        photo = ((photo - addition) / transmittance.clamp_min(MIN_SHOWN)).clamp(0, 1)
-    return photo if view.gain is None else photo / view.gain.to(photo), shown
+        color = ((color - addition) / transmittance.clamp_min(MIN_SHOWN)).clamp(0, 1)
+    return _Scene(color if view.gain is None else color / view.gain.to(color), shown, reduction)
 
 
-def _sights(sphere: Tensor, points: Tensor, view: View, photo: Tensor, shown: Tensor, reduction: int) -> _Sights:
-    height, width = photo.shape[:2]
-    camera = view.world_to_camera[None], view.intrinsics[None], height * reduction, width * reduction
+def _pixels(positions: Tensor, view: View, scene: _Scene) -> tuple[Tensor, Tensor]:
+    """Indices [M] of the positions [N, 3] in the frame of a view, and their working pixels [M], row by row."""
+    height, width = scene.shown.shape[:2]
+    reduction = scene.reduction
+    lens = view.intrinsics[None]
+    _, index, position, _ = project(positions, view.world_to_camera[None], lens, height * reduction, width * reduction)
+    x, y = (position / reduction).long().unbind(dim=-1)
+    return index, y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
 
-    def pixels(positions: Tensor) -> tuple[Tensor, Tensor]:
-        _, index, position, _ = project(positions, *camera)
-        x, y = (position / reduction).long().unbind(dim=-1)
-        return index, y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
 
-    taken = torch.zeros(height * width, device=sphere.device)
-    taken[pixels(points)[1]] = 1
+def _near_points(points: Tensor, view: View, scene: _Scene) -> Tensor:
+    """[h w] bool: one of the scene's points is in the working pixel or around it."""
+    height, width = scene.shown.shape[:2]
+    taken = torch.zeros(height * width, device=points.device)
+    taken[_pixels(points, view, scene)[1]] = 1
     side = 2 * OCCLUSION_RADIUS + 1
-    taken = nn.functional.max_pool2d(taken.reshape(1, height, width), side, 1, OCCLUSION_RADIUS).flatten()
-    direction, pixel = pixels(sphere)
-    photo, shown = photo.to(sphere).reshape(-1, 3), shown.to(sphere.device).flatten()
-    return _Sights(direction, pixel, photo[pixel], (taken[pixel] == 0) & shown[pixel], (height, width))
+    return nn.functional.max_pool2d(taken.reshape(1, height, width), side, 1, OCCLUSION_RADIUS).flatten() > 0
 
 
-def _by_direction(color: Tensor, direction: Tensor, static: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Sorted by direction, then by brightness."""
+def _explanation(
+    positions: Tensor, views: Sequence[View], scenes: Sequence[_Scene], taken: Sequence[Tensor]
+) -> _Explanation:
+    count, means, sights = len(positions), _Means(scenes), []
+    for view, scene, near in zip(views, scenes, taken, strict=True):
+        index, pixel = _pixels(positions, view, scene)
+        color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (scene.color, means.of(scene)))
+        shown = scene.shown.flatten().to(positions.device)[pixel]
+        sights.append((index, color, still, shown, shown & ~near[pixel]))
+    index, color, still, shown, free = (torch.cat(each) for each in zip(*sights, strict=True))
+    in_frame, shown = torch.bincount(index, minlength=count), torch.bincount(index[shown], minlength=count)
+    index, color, still = index[free], color[free], still[free]
     order = torch.argsort(color.sum(dim=-1))
-    order = order[torch.argsort(direction[order], stable=True)]
-    return color[order], direction[order], static[order]
+    order = order[torch.argsort(index[order], stable=True)]
+    index, color, still = index[order], color[order], still[order]
+    sights = torch.bincount(index, minlength=count)
+    middle = sights.cumsum(0) - sights + sights // 2
+    median = color.new_zeros(count, 3)
+    median[sights > 0] = color[middle[sights > 0]]
+    residuals = torch.stack([(color - other).abs().sum(dim=-1) for other in (median[index], still)], dim=-1)
+    residual, still = (summed(index, residuals, count) / sights.clamp_min(1)[:, None]).unbind(dim=-1)
+    return _Explanation(median, residual, still, sights, shown, in_frame)

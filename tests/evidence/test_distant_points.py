@@ -69,15 +69,35 @@ def test_a_picture_that_stands_still_in_the_frame_is_not_far_away() -> None:
     assert len(distant_points(GROUND, turning_views(still=True), SIGHT).positions) < 0.1 * sky_seeds
 
 
-def test_colors_are_those_behind_a_film_and_nothing_is_taken_from_what_hides() -> None:
+def test_colors_are_those_behind_a_film() -> None:
     T, B = torch.full((HEIGHT, WIDTH, 1), 0.7), torch.full((HEIGHT, WIDTH, 3), 0.2)
-    film = distant_points(GROUND, turning_views((T, B)), [(T, B)] * 7)
-    assert errors(film).mean() < 0.03
+    found = distant_points(GROUND, turning_views((T, B)), [(T, B)] * 7)
+    assert len(found.positions) > 200
+    assert errors(found).mean() < 0.03
+
+
+def test_the_sky_goes_on_behind_a_panel_without_its_color() -> None:
     hiding = torch.where(torch.arange(WIDTH)[:, None] < 30, 0.02, 1.0).expand(HEIGHT, WIDTH, 1)
     panel = (hiding, (1 - hiding) * torch.tensor([0.9, 0.1, 0.1]))
     found = distant_points(GROUND, turning_views(panel), [panel] * 7)
-    assert len(found.positions) > 100
-    assert errors(found).mean() < 0.03
+    without = distant_points(GROUND, turning_views(), SIGHT)
+    assert len(found.positions) == pytest.approx(len(without.positions), rel=0.1)
+    assert errors(found).median() < 0.03
+    assert not ((found.colors[:, 0] > 0.88) & (found.colors[:, 1] < 0.15)).any(), "the panel's"
+
+
+def test_a_wall_without_points_is_not_far_away() -> None:
+    """It has parallax: cameras that move sideways see the same of it elsewhere."""
+    wall_at, views = 5.0, []
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    for number in range(7):
+        pose = torch.eye(4)
+        pose[0, 3] = 0.3 - 0.1 * number
+        across = (x - 40) / 70 * wall_at - pose[0, 3]
+        views.append(View(sky(torch.stack([across / 5, y * 0, y * 0 + 1], dim=-1)), None, pose, K))
+    # Its points are at the sides, and no wider than the wall is far.
+    points = torch.tensor([[side * (3.0 + 0.1 * i), 0.0, wall_at] for i in range(30) for side in (-1, 1)])
+    assert not len(distant_points(points, views, SIGHT).positions)
 
 
 def test_masked_pixels_and_gains_count() -> None:
