@@ -55,11 +55,14 @@ class DistantPoints:
     spacing: float
     """Distance of neighbors, world units."""
 
+    def __len__(self) -> int:
+        return len(self.positions)
+
 
 @torch.no_grad()
 def distant_points(
     points: Tensor, views: Sequence[View], layers: Sequence[tuple[Tensor, Tensor] | None]
-) -> DistantPoints:
+) -> tuple[DistantPoints, DistantPoints]:
     """Find directions in which the photos show something far away, and no point is seen.
 
     A direction is a candidate if most of the views that show it see none of the scene's points around it, and if one
@@ -74,7 +77,7 @@ def distant_points(
         layers: of each view's artifact, T [H, W, 1 or 3] and B [H, W, 3]; None where it has none.
 
     Returns:
-        The points, on the device of the scene's; there may be none.
+        The points that photos show, and those that the artifact hides, on the device of the scene's; there may be none.
     """
     every = -(-len(views) // MAX_VIEWS)
     views, layers = views[::every], layers[::every]
@@ -94,7 +97,8 @@ def distant_points(
     likely = shown & (far.sights >= MIN_SIGHTS) & (2 * far.sights >= far.shown) & (far.residual <= far.still)
     candidates = likely.nonzero()[:, 0]
     if not len(candidates):
-        return DistantPoints(directions[:0], directions[:0], radius * angle)
+        nothing = DistantPoints(directions[:0], directions[:0], radius * angle)
+        return nothing, nothing
     alternatives = [_explanation(center + at * directions[candidates], views, scenes, taken) for at in nearer]
     area = _connected(directions[candidates], 1.5 * angle)
     count = int(area.max()) + 1
@@ -104,14 +108,15 @@ def distant_points(
     distant = (of_area[:, :1] < of_area[:, 1:]).all(dim=1)[area]
     found = torch.zeros_like(shown)
     found[candidates[distant]] = True
-    colors = far.median
-    hidden = ((far.in_frame >= MIN_SIGHTS) & ~shown).nonzero()[:, 0]
-    if found.any() and len(hidden):
-        seen = shown.nonzero()[:, 0]
-        _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[hidden].cpu().numpy())
-        source = seen[torch.from_numpy(np.asarray(nearest)).to(seen)]
-        colors[hidden], found[hidden] = colors[source], found[source]
-    return DistantPoints(center + radius * directions[found], colors[found], radius * angle)
+    behind = ((far.in_frame >= MIN_SIGHTS) & ~shown).nonzero()[:, 0]
+    seen = shown.nonzero()[:, 0]
+    _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[behind].cpu().numpy())
+    source = seen[torch.from_numpy(np.asarray(nearest, dtype=np.int64)).to(seen)]
+    behind, source = behind[found[source]], source[found[source]]
+    return (
+        DistantPoints(center + radius * directions[found], far.median[found], radius * angle),
+        DistantPoints(center + radius * directions[behind], far.median[source], radius * angle),
+    )
 
 
 @dataclass(frozen=True)

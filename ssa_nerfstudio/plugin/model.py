@@ -29,7 +29,12 @@ from ssa_nerfstudio.plugin.training import nonfinite
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.regularizers import regularizers
 from ssa_nerfstudio.plugin.training.scene_brightness import clear_the_clearest
-from ssa_nerfstudio.plugin.training.seed_points import color_parameters, distant_gaussians, outside_cameras
+from ssa_nerfstudio.plugin.training.seed_points import (
+    append_gaussians,
+    color_parameters,
+    distant_gaussians,
+    outside_cameras,
+)
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
@@ -76,6 +81,8 @@ class SSASplatfactoModel(PhotoLosses):
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
         self.register_buffer("by_mcmc", torch.tensor(self.config.strategy == "mcmc"))
         self._near_plane, self._near_plane_is_set = NEAR_PLANE, False
+        self.backdrop: DistantPoints | None = None
+        """Distant points that the artifact hides from all photos. The scene gets them after the last step."""
         self.metrics_every = 10
         self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
@@ -146,16 +153,19 @@ class SSASplatfactoModel(PhotoLosses):
         super().step_post_backward(step)
 
     def end_training(self, step: int) -> None:
-        """After the last step: the scene gets the brightness of the photos' clearest pixels.
+        """After the last step: the scene gets the brightness of the photos' clearest pixels, and its backdrop.
 
-        Not where some photos have no overlay, which fix the brightness, nor where something else stands between the
-        scene and a photo, as exposure or a bilateral grid does.
+        The former not where some photos have no overlay, which fix the brightness, nor where something else stands
+        between the scene and a photo, as exposure or a bilateral grid does.
         """
-        if self.config.overlay_film == "kept" or self.exposure is not None or self.config.use_bilateral_grid:
-            return
+        alone = self.exposure is None and not self.config.use_bilateral_grid
         learned = self.artifacts.learned()
-        if learned and not len(self.artifacts.bare_keys):
+        if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
+        if self.backdrop is not None and len(self.backdrop):
+            # Sooner, no photo would hold them: densification removes what no photo shows.
+            new = distant_gaussians(self.backdrop, self.gauss_params, self.config.sh_degree, opacity=0.99)
+            append_gaussians(new, self.gauss_params, self.optimizers)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.

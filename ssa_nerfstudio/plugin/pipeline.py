@@ -117,18 +117,19 @@ class SSAPipeline(VanillaPipeline):
         self.model.examine(self.datamanager)
 
     def _add_distant_seeds(self, photos: list[dict[str, Any]]) -> None:
-        """Where an overlay is trained, and nothing is resumed: an overlay learns faster than splats that must grow."""
+        """Where an overlay is trained, which learns faster than splats that must first grow into the frame."""
         config, points, artifacts = self.config.model, self._points(), self.model.artifacts
         wanted = config.distant_seeds and config.overlay_start == "points" and not config.random_init
-        if not wanted or self.config.artifacts_of or not len(artifacts) or points is None or not len(points):
+        if not wanted or not len(artifacts) or points is None or not len(points):
             return
         cameras, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
         views = views_of(photos, cameras, None if exposure is None else exposure.transforms.detach()[:, 0].exp())
         with torch.no_grad():
-            own = [artifacts.of_view(view) for view in range(len(views))]
-            layers = [None if overlay is None else overlay.layers() for overlay in own]
-            seeds = distant_points(points.to(views[0].image.device), views, layers)
-        if len(seeds.positions):
+            of_groups = [artifacts[group].layers() for group in range(len(artifacts))]
+            own = [artifacts.group_of_view(view) for view in range(len(views))]
+            layers = [None if group is None else of_groups[group] for group in own]
+            seeds, self.model.backdrop = distant_points(points.to(views[0].image.device), views, layers)
+        if len(seeds) and not self.config.artifacts_of:  # of a resumed run
             self.model.add_seeds(seeds)
 
     def _set_budget(self) -> None:

@@ -6,9 +6,10 @@ import logging
 import math
 
 import torch
+from gsplat.strategy.ops import _update_param_with_optimizer
 from nerfstudio.models.splatfacto import RGB2SH
 from torch import Tensor
-from torch.nn import ParameterDict
+from torch.nn import Parameter, ParameterDict
 
 from ssa_nerfstudio.evidence.distant_points import DistantPoints
 from ssa_nerfstudio.evidence.point_samples import project, regular_subset
@@ -62,19 +63,36 @@ def color_parameters(colors: Tensor, sh_degree: int) -> Tensor:
     return RGB2SH(values) if sh_degree > 0 else torch.logit(values, eps=1e-6)
 
 
-def distant_gaussians(seeds: DistantPoints, others: ParameterDict, sh_degree: int) -> dict[str, Tensor]:
-    """Parameters of Gaussians at distant points, round, and as opaque as the first of the other Gaussians.
+def distant_gaussians(
+    seeds: DistantPoints, others: ParameterDict, sh_degree: int, opacity: float | None = None
+) -> dict[str, Tensor]:
+    """Parameters of Gaussians at distant points, round and as wide as the points are apart.
 
     Args:
         seeds: N points.
         others: the model's Gaussians, at least one.
         sh_degree: the model's degree of spherical harmonics.
+        opacity: in (0, 1); None: that of the first of the others.
     """
-    count = len(seeds.positions)
+    count = len(seeds)
     new = {name: values.data.new_zeros(count, *values.shape[1:]) for name, values in others.items()}
     new["means"].copy_(seeds.positions)
     new["scales"].fill_(math.log(seeds.spacing))
     new["quats"][:, 0] = 1
     new["features_dc"].copy_(color_parameters(seeds.colors, sh_degree))
-    new["opacities"].copy_(others["opacities"].data[:1].expand(count, 1))
+    logit = others["opacities"].data[:1] if opacity is None else torch.tensor(opacity).logit()
+    new["opacities"].copy_(logit.expand(count, 1))
     return new
+
+
+def append_gaussians(
+    new: dict[str, Tensor], params: ParameterDict, optimizers: dict[str, torch.optim.Optimizer]
+) -> None:
+    """Append Gaussians to those that are trained, so that a checkpoint of both can be resumed."""
+    count = len(new["means"])
+    _update_param_with_optimizer(
+        lambda name, values: Parameter(torch.cat([values.data, new[name]])),
+        lambda _, state: torch.cat([state, state.new_zeros(count, *state.shape[1:])]),
+        params,
+        optimizers,
+    )

@@ -1,0 +1,77 @@
+"""Distant points become Gaussians: those that photos show before the first step, those that none shows after the last.
+
+What they are, tests/evidence/test_distant_points.py tests; here it is stated.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from ssa_nerfstudio.evidence.distant_points import DistantPoints
+from ssa_nerfstudio.plugin import pipeline as pipeline_module
+
+FOUND = DistantPoints(torch.tensor([[0.0, 0.0, 40.0], [1.0, 0.0, 40.0]]), torch.tensor([[0.2, 0.4, 0.9]] * 2), 1.0)
+HIDDEN = DistantPoints(torch.tensor([[0.0, 1.0, 40.0]]), torch.tensor([[0.9, 0.5, 0.1]]), 1.0)
+
+
+@pytest.fixture
+def stated_points(monkeypatch):
+    """Calls of `distant_points`, which finds FOUND and HIDDEN."""
+    calls = []
+
+    def distant_points(points, views, layers):
+        calls.append((points, views, layers))
+        return FOUND, HIDDEN
+
+    monkeypatch.setattr(pipeline_module, "distant_points", distant_points)
+    return calls
+
+
+def started(scene, folder, configure_training, **settings):
+    """The model before the first step."""
+    config = configure_training("ssa-splatfacto", scene, folder, 2, {"num_downscales": 0, **settings})
+    return config.pipeline.setup(device="cpu", test_mode="val", world_size=1, local_rank=0).model
+
+
+@pytest.mark.parametrize("strategy", ["adc", "mcmc"])
+def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
+    tiny_scene, tmp_path, configure_training, train_and_evaluate, stated_points, strategy: str
+) -> None:
+    plain = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy, distant_seeds=False)
+    assert not stated_points
+    model = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy)
+    assert model.num_points == plain.num_points + 2
+    torch.testing.assert_close(model.means[-2:].detach(), FOUND.positions)
+    assert model.opacities[-1].item() == pytest.approx(model.opacities[0].item())
+    [(points, views, layers)] = stated_points
+    assert len(points) == plain.num_points
+    assert len(views) == len(layers) == 12
+    assert [tuple(layer.shape) for layer in layers[0]] == [(48, 64, 1), (48, 64, 3)]
+
+    settings = {"num_downscales": 0, "overlay": "on", "strategy": strategy}
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "run", 3, settings)
+    _, pipeline, path = train_and_evaluate(config)
+    trained = pipeline.model
+    assert trained.num_points == plain.num_points + 3, "too few steps for a refinement"
+    torch.testing.assert_close(trained.means[-1].detach(), HIDDEN.positions[0])
+    assert trained.opacities[-1].sigmoid().item() == pytest.approx(0.99)
+    assert trained.scales[-1].tolist() == pytest.approx([math.log(HIDDEN.spacing)] * 3)
+    torch.testing.assert_close(trained.colors[-1].detach(), HIDDEN.colors[0])
+
+    # A resumed run has the checkpoint's, starts from no others, and trains on.
+    longer = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "longer", 6, settings)
+    longer.load_dir = path.parent / "nerfstudio_models"
+    _, pipeline, _ = train_and_evaluate(longer)
+    assert pipeline.model.num_points == trained.num_points + 1
+    assert all(torch.isfinite(values).all() for values in pipeline.model.gauss_params.values())
+
+
+@pytest.mark.parametrize("settings", [{"overlay": "off"}, {"overlay": "on", "overlay_start": "statistics"}])
+def test_a_training_without_an_overlay_or_by_the_papers_rule_has_none(
+    tiny_scene, tmp_path, configure_training, stated_points, settings
+) -> None:
+    started(tiny_scene, tmp_path, configure_training, **settings)
+    assert not stated_points
