@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import torch
 from nerfstudio.cameras.cameras import Cameras, CameraType
 from torch import Tensor
 
 from ssa_nerfstudio.cameras.groups import group_frames, same_intrinsics
-from ssa_nerfstudio.cameras.lens import Lens
+from ssa_nerfstudio.cameras.lens import Lens, distort, undistorted_lens
+
+_LOG = logging.getLogger(__name__)
 
 LENS_VALUES = 13
 """width, height, fx, fy, cx, cy, k1, k2, k3, k4, p1, p2, and the number of nerfstudio's camera type."""
@@ -86,3 +90,15 @@ def describe(cameras: Cameras) -> Tensor:
     """width, height, fx, fy, cx, cy of each camera: [N, 6] float64 on the CPU."""
     fields = (cameras.width, cameras.height, cameras.fx, cameras.fy, cameras.cx, cameras.cy)
     return torch.stack([f.reshape(-1).to("cpu", torch.float64) for f in fields], dim=-1)
+
+
+def tell_of_fisheyes(cameras: Cameras) -> None:
+    """Warn of what the undistortion of fisheye photos leaves out."""
+    for raw in list(fisheye_lenses(cameras).values())[:1]:
+        target = undistorted_lens(raw)
+        angle = 2 * np.degrees(np.arctan(target.width / 2 / target.fx))
+        left = distort(np.ones((target.height, target.width), np.float32), raw, 0.0).mean()
+        _LOG.warning(
+            f"fisheye photos are undistorted: training sees {angle:.0f} degrees across, {left:.0%} of their pixels. "
+            "gsplat 1.4.0 draws fisheye lenses without distortion alone"
+        )

@@ -25,16 +25,10 @@ from ssa_nerfstudio.plugin.photo_formation import clean_image
 from ssa_nerfstudio.plugin.photo_losses import PhotoLosses
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
-from ssa_nerfstudio.plugin.training import nonfinite
+from ssa_nerfstudio.plugin.training import nonfinite, seed_points
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
 from ssa_nerfstudio.plugin.training.regularizers import regularizers
 from ssa_nerfstudio.plugin.training.scene_brightness import clear_the_clearest
-from ssa_nerfstudio.plugin.training.seed_points import (
-    append_gaussians,
-    color_parameters,
-    distant_gaussians,
-    outside_cameras,
-)
 from ssa_nerfstudio.plugin.view_geometry import frame, intrinsics, metadata, view_matrix
 from ssa_nerfstudio.plugin.viewer import ArtifactControls, is_viewer_frame
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
@@ -72,7 +66,7 @@ class SSASplatfactoModel(PhotoLosses):
         self.seed_points = points
         nonfinite.replace_nonfinite_scales(self.scales.data)
         if points is not None and not self.config.random_init and len(points[1]):
-            self.gauss_params["features_dc"] = Parameter(color_parameters(points[1], self.config.sh_degree))
+            self.gauss_params["features_dc"] = Parameter(seed_points.color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
         self._draw = SplatRenderer(self.config.rasterizer)
@@ -82,7 +76,7 @@ class SSASplatfactoModel(PhotoLosses):
         self.register_buffer("by_mcmc", torch.tensor(self.config.strategy == "mcmc"))
         self._near_plane, self._near_plane_is_set = NEAR_PLANE, False
         self.backdrop: DistantPoints | None = None
-        """Distant points that the artifact hides from all photos. The scene gets them after the last step."""
+        """Distant points that no photo shows, for the end of the training."""
         self.metrics_every = 10
         self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
@@ -130,17 +124,10 @@ class SSASplatfactoModel(PhotoLosses):
 
     def start_outside_cameras(self, positions: Tensor) -> None:
         """Drop seed points inside a camera at positions [V, 3]; call it before the optimizers are built."""
-        outside = outside_cameras(self.means.data, positions)
+        outside = seed_points.outside_cameras(self.means.data, positions)
         if self.config.guards and not outside.all():
             for name, values in self.gauss_params.items():
                 self.gauss_params[name] = Parameter(values.data[outside])
-
-    @torch.no_grad()
-    def add_seeds(self, seeds: DistantPoints) -> None:
-        """Add Gaussians that are as large as the points' spacing; call it before the optimizers are built."""
-        new = distant_gaussians(seeds, self.gauss_params, self.config.sh_degree)
-        for name, values in self.gauss_params.items():
-            self.gauss_params[name] = Parameter(torch.cat([values.data, new[name]]))
 
     def step_post_backward(self, step: int) -> None:
         """After the optimizers' step: clamp parameters, then densify."""
@@ -162,10 +149,8 @@ class SSASplatfactoModel(PhotoLosses):
         learned = self.artifacts.learned()
         if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
-        if self.backdrop is not None and len(self.backdrop):
-            # Sooner, no photo would hold them: densification removes what no photo shows.
-            new = distant_gaussians(self.backdrop, self.gauss_params, self.config.sh_degree, opacity=0.99)
-            append_gaussians(new, self.gauss_params, self.optimizers)
+        if self.backdrop is not None:
+            seed_points.add_distant(self.backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.

@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 from nerfstudio.engine.callbacks import TrainingCallback, TrainingCallbackLocation
 from nerfstudio.pipelines.base_pipeline import VanillaPipeline, VanillaPipelineConfig
@@ -17,27 +15,26 @@ from torch.cuda.amp.grad_scaler import GradScaler
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.cameras.groups import same_intrinsics
-from ssa_nerfstudio.cameras.lens import distort, undistorted_lens
 from ssa_nerfstudio.cameras.panorama import Face
 from ssa_nerfstudio.data.panorama_entry import read_panorama
 from ssa_nerfstudio.data.training_requirements import check_seed_points, check_split_options, check_training
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.distant_points import distant_points
 from ssa_nerfstudio.evidence.point_samples import PointSamples
-from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, fisheye_lenses, group_cameras
+from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, group_cameras, tell_of_fisheyes
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.decisions import tell
+from ssa_nerfstudio.plugin.distant_seeds import find_distant_seeds
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
 from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
-from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays, views_of
+from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.densification import gaussian_budget
-from ssa_nerfstudio.plugin.training.seed_points import nearest_depth
+from ssa_nerfstudio.plugin.training.seed_points import add_distant, nearest_depth
 from ssa_nerfstudio.plugin.triton_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
@@ -98,7 +95,7 @@ class SSAPipeline(VanillaPipeline):
 
     def _examine_photos(self) -> None:
         """All that reads the training photos before the first step."""
-        _tell_of_fisheyes(self.datamanager.train_dataset.raw_cameras)
+        tell_of_fisheyes(self.datamanager.train_dataset.raw_cameras)
         lenses = describe_lenses(self.datamanager.train_dataset.raw_cameras)
         # Undistorts and crops the photos and rewrites the cameras: overlays and depths are of the undistorted frame.
         photos = self.datamanager.cached_train
@@ -117,20 +114,16 @@ class SSAPipeline(VanillaPipeline):
         self.model.examine(self.datamanager)
 
     def _add_distant_seeds(self, photos: list[dict[str, Any]]) -> None:
-        """Where an overlay is trained, which learns faster than splats that must first grow into the frame."""
-        config, points, artifacts = self.config.model, self._points(), self.model.artifacts
-        wanted = config.distant_seeds and config.overlay_start == "points" and not config.random_init
-        if not wanted or not len(artifacts) or points is None or not len(points):
-            return
-        cameras, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
-        views = views_of(photos, cameras, None if exposure is None else exposure.transforms.detach()[:, 0].exp())
-        with torch.no_grad():
-            of_groups = [artifacts[group].layers() for group in range(len(artifacts))]
-            own = [artifacts.group_of_view(view) for view in range(len(views))]
-            layers = [None if group is None else of_groups[group] for group in own]
-            seeds, self.model.backdrop = distant_points(points.to(views[0].image.device), views, layers)
-        if len(seeds) and not self.config.artifacts_of:  # of a resumed run
-            self.model.add_seeds(seeds)
+        model, cameras = self.model, self.datamanager.train_dataset.cameras
+        found = find_distant_seeds(model.config, model.artifacts, photos, cameras, self._points(), self._gains())
+        if found is not None:
+            shown, model.backdrop = found
+            if not self.config.artifacts_of:  # a resumed run has its checkpoint's Gaussians
+                add_distant(shown, model.gauss_params, model.config.sh_degree)
+
+    def _gains(self) -> torch.Tensor | None:
+        """Of the photos [V, 3], where their exposure is learned."""
+        return None if self.model.exposure is None else self.model.exposure.transforms.detach()[:, 0].exp()
 
     def _set_budget(self) -> None:
         config, cameras = self.config.model, self.datamanager.train_dataset.cameras
@@ -213,10 +206,9 @@ class SSAPipeline(VanillaPipeline):
         if setting == "given":
             overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
-            views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
-            gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
+            views = self.datamanager.train_dataset.cameras
             learned = learned_overlays(
-                self.config.model, photos, names, views, self._points(), groups, sizes, gains,
+                self.config.model, photos, names, views, self._points(), groups, sizes, self._gains(),
                 lambda group: self._withheld_photos(keys[group]), self._faces(keys),
             )  # fmt: skip
             overlays = [each.overlay for each in learned]
@@ -296,17 +288,6 @@ def check_data(config: SSAPipelineConfig, test_mode: Literal["test", "val", "inf
 def _source(config: SSAPipelineConfig) -> Path:
     data = config.datamanager.data or config.datamanager.dataparser.data
     return Path(data)
-
-
-def _tell_of_fisheyes(cameras: Cameras) -> None:
-    for raw in list(fisheye_lenses(cameras).values())[:1]:
-        target = undistorted_lens(raw)
-        angle = 2 * np.degrees(np.arctan(target.width / 2 / target.fx))
-        left = distort(np.ones((target.height, target.width), np.float32), raw, 0.0).mean()
-        _LOG.warning(
-            f"fisheye photos are undistorted: training sees {angle:.0f} degrees across, {left:.0%} of their pixels. "
-            "gsplat 1.4.0 draws fisheye lenses without distortion alone"
-        )
 
 
 def _extent(positions: torch.Tensor) -> float:

@@ -63,33 +63,39 @@ def color_parameters(colors: Tensor, sh_degree: int) -> Tensor:
     return RGB2SH(values) if sh_degree > 0 else torch.logit(values, eps=1e-6)
 
 
-def distant_gaussians(
-    seeds: DistantPoints, others: ParameterDict, sh_degree: int, opacity: float | None = None
-) -> dict[str, Tensor]:
-    """Parameters of Gaussians at distant points, round and as wide as the points are apart.
+@torch.no_grad()
+def add_distant(
+    points: DistantPoints,
+    params: ParameterDict,
+    sh_degree: int,
+    opacity: float | None = None,
+    optimizers: dict[str, torch.optim.Optimizer] | None = None,
+) -> None:
+    """Add Gaussians at distant points, round and as wide as the points are apart.
+
+    What no photo shows is added after the last step: densification would remove it.
 
     Args:
-        seeds: N points.
-        others: the model's Gaussians, at least one.
+        points: N of them.
+        params: of the model's Gaussians, at least one.
         sh_degree: the model's degree of spherical harmonics.
         opacity: in (0, 1); None: that of the first of the others.
+        optimizers: of the parameters, by their names, so that a checkpoint can be resumed; None before they are built.
     """
-    count = len(seeds)
-    new = {name: values.data.new_zeros(count, *values.shape[1:]) for name, values in others.items()}
-    new["means"].copy_(seeds.positions)
-    new["scales"].fill_(math.log(seeds.spacing))
+    count = len(points)
+    new = {name: values.data.new_zeros(count, *values.shape[1:]) for name, values in params.items()}
+    new["means"].copy_(points.positions)
+    new["scales"].fill_(math.log(points.spacing))
     new["quats"][:, 0] = 1
-    new["features_dc"].copy_(color_parameters(seeds.colors, sh_degree))
-    logit = others["opacities"].data[:1] if opacity is None else torch.tensor(opacity).logit()
+    new["features_dc"].copy_(color_parameters(points.colors, sh_degree))
+    logit = params["opacities"].data[:1] if opacity is None else torch.tensor(opacity).logit()
     new["opacities"].copy_(logit.expand(count, 1))
-    return new
-
-
-def append_gaussians(
-    new: dict[str, Tensor], params: ParameterDict, optimizers: dict[str, torch.optim.Optimizer]
-) -> None:
-    """Append Gaussians to those that are trained, so that a checkpoint of both can be resumed."""
-    count = len(new["means"])
+    if not count:
+        return
+    if optimizers is None:
+        for name, values in params.items():
+            params[name] = Parameter(torch.cat([values.data, new[name]]))
+        return
     _update_param_with_optimizer(
         lambda name, values: Parameter(torch.cat([values.data, new[name]])),
         lambda _, state: torch.cat([state, state.new_zeros(count, *state.shape[1:])]),

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from ssa_nerfstudio.evidence.distant_points import DistantPoints
-from ssa_nerfstudio.plugin import pipeline as pipeline_module
+from ssa_nerfstudio.plugin import distant_seeds
 
 FOUND = DistantPoints(torch.tensor([[0.0, 0.0, 40.0], [1.0, 0.0, 40.0]]), torch.tensor([[0.2, 0.4, 0.9]] * 2), 1.0)
 HIDDEN = DistantPoints(torch.tensor([[0.0, 1.0, 40.0]]), torch.tensor([[0.9, 0.5, 0.1]]), 1.0)
@@ -26,7 +26,7 @@ def stated_points(monkeypatch):
         calls.append((points, views, layers))
         return FOUND, HIDDEN
 
-    monkeypatch.setattr(pipeline_module, "distant_points", distant_points)
+    monkeypatch.setattr(distant_seeds, "distant_points", distant_points)
     return calls
 
 
