@@ -58,36 +58,61 @@ class DistantPoints:
     def __len__(self) -> int:
         return len(self.positions)
 
+    def table(self) -> Tensor:
+        """[N, 7], for a checkpoint: positions, colors and the spacing."""
+        return torch.cat([self.positions, self.colors, torch.full_like(self.positions[:, :1], self.spacing)], dim=-1)
+
+    @classmethod
+    def of_table(cls, table: Tensor) -> DistantPoints:
+        """The points of a `table`; of an empty one the spacing is 1."""
+        return cls(table[:, :3], table[:, 3:6], float(table[0, 6]) if len(table) else 1.0)
+
 
 @torch.no_grad()
 def distant_points(
-    points: Tensor, views: Sequence[View], layers: Sequence[tuple[Tensor, Tensor] | None]
+    points: Tensor,
+    views: Sequence[View],
+    layers: Sequence[tuple[Tensor, Tensor] | None],
+    groups: Sequence[int],
+    artifact_is_exposed: bool = False,
 ) -> tuple[DistantPoints, DistantPoints]:
     """Find directions in which the photos show something far away, and no point is seen.
 
-    A direction is a candidate if most of the views that show it see none of the scene's points around it, and if one
+    A direction is a candidate if half of the views that show it see none of the scene's points around it, and if one
     color for it explains these photos at least as well as one color for each of their pixels does: what stands still in
     the frame is an artifact. A connected area of candidates is far away if that explains its photos better than any
-    distance does at which the scene has its points: what is nearer has parallax. What the artifact hides from all views
-    continues what is seen nearest to it.
+    distance does at which the scene has its points: what is nearer has parallax. Where cameras are too close together
+    to have any, nothing speaks against it. A direction that fewer than MIN_SIGHTS of the views show, because of an
+    artifact or a mask, continues what is seen nearest to it.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
         views: at least one.
-        layers: of each view's artifact, T [H, W, 1 or 3] and B [H, W, 3]; None where it has none.
+        layers: of each view's artifact, T [H, W, 1 or 3] and B [H, W, 3]; None where it has none. Views with the same
+            artifact have the same tuple.
+        groups: of each view: views of one group have the same camera and the same artifact.
+        artifact_is_exposed: views' gains act on scene and artifact together, and not on the scene alone.
 
     Returns:
-        The points that photos show, and those that the artifact hides, on the device of the scene's; there may be none.
+        The points that photos show, and those that they hide, on the device of the scene's; there may be none.
     """
     every = -(-len(views) // MAX_VIEWS)
-    views, layers = views[::every], layers[::every]
+    kept = [view for group in sorted({*groups}) for view in _members(groups, group)[::every]]
+    views, layers = [views[view] for view in kept], [layers[view] for view in kept]
+    groups = [groups[view] for view in kept]
     points = regular_subset(points, len(views))
     poses = torch.stack([view.world_to_camera for view in views])
-    center = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].mean(dim=0).to(points)
+    cameras = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].to(points)
+    center = cameras.mean(dim=0)
+    baseline = float((cameras - center).norm(dim=1).max())
     distances = (points - center).norm(dim=1)
     nearer = [float(distances.kthvalue(math.ceil(share * len(points))).values) for share in NEARER]
     radius = DISTANCE * nearer[-1]
-    scenes = [_scene_in(view, of_artifact) for view, of_artifact in zip(views, layers, strict=True)]
+    of_views = {id(pair): _reduced_layers(pair, view) for pair, view in zip(layers, views, strict=True) if pair}
+    scenes = [
+        _scene_in(view, of_views.get(id(pair)), group, artifact_is_exposed)
+        for view, pair, group in zip(views, layers, groups, strict=True)
+    ]
     angles = [scene.reduction / float(view.intrinsics[0, 0]) for scene, view in zip(scenes, views, strict=True)]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
@@ -99,10 +124,13 @@ def distant_points(
     if not len(candidates):
         nothing = DistantPoints(directions[:0], directions[:0], radius * angle)
         return nothing, nothing
+    nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
     alternatives = [_explanation(center + at * directions[candidates], views, scenes, taken) for at in nearer]
     area = _connected(directions[candidates], 1.5 * angle)
     count = int(area.max()) + 1
-    comparable = torch.stack([other.sights >= MIN_SIGHTS for other in alternatives]).all(dim=0)
+    comparable = torch.ones_like(candidates, dtype=torch.bool)
+    for other in alternatives:
+        comparable &= other.sights >= MIN_SIGHTS
     residuals = torch.stack([far.residual[candidates], *(other.residual for other in alternatives)], dim=-1)
     of_area = summed(area, torch.where(comparable[:, None], residuals, 0), count)
     distant = (of_area[:, :1] < of_area[:, 1:]).all(dim=1)[area]
@@ -129,6 +157,8 @@ class _Scene:
     """[h, w, 1] bool: no mask and no opaque artifact is there."""
     reduction: int
     """Photo pixels a working pixel."""
+    group: int
+    """Of its view."""
 
 
 @dataclass(frozen=True)
@@ -150,18 +180,23 @@ class _Explanation:
 
 
 class _Means:
-    """Mean over the photos of one size, pixel by pixel, for each size."""
+    """Mean over the photos of one group and size, pixel by pixel."""
 
     def __init__(self, scenes: Sequence[_Scene]) -> None:
-        self._sums: dict[torch.Size, Tensor] = {}
+        self._sums: dict[tuple[int, torch.Size], Tensor] = {}
         for scene in scenes:
             total = torch.cat([scene.color * scene.shown, scene.shown.to(scene.color)], dim=-1)
-            self._sums[scene.shown.shape] = self._sums.get(scene.shown.shape, 0) + total
+            key = scene.group, scene.shown.shape
+            self._sums[key] = self._sums.get(key, 0) + total
 
     def of(self, scene: _Scene) -> Tensor:
-        """[h w, 3], of the photos of a scene's size."""
-        total = self._sums[scene.shown.shape].reshape(-1, 4)
+        """[h w, 3], of the photos of a scene's group."""
+        total = self._sums[scene.group, scene.shown.shape].reshape(-1, 4)
         return total[:, :3] / total[:, 3:].clamp_min(1)
+
+
+def _members(groups: Sequence[int], group: int) -> list[int]:
+    return [view for view, of in enumerate(groups) if of == group]
 
 
 def _directions(count: int) -> Tensor:
@@ -179,19 +214,27 @@ def _connected(directions: Tensor, angle: float) -> Tensor:
     return torch.from_numpy(connected_components(linked, directed=False)[1].astype(np.int64)).to(directions.device)
 
 
-def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None) -> _Scene:
+def _reduced_layers(layers: tuple[Tensor, Tensor], view: View) -> tuple[Tensor, Tensor]:
+    """T [h, w, 1] and B [h, w, 3] at the working resolution, on the device of the photos."""
+    reduction = working_reduction(*view.image.shape[:2])
+    transmittance, addition = (reduced(layer, reduction).to(view.image.device) for layer in layers)
+    return transmittance.mean(dim=-1, keepdim=True), addition
+
+
+def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, group: int, artifact_is_exposed: bool) -> _Scene:
     height, width = view.image.shape[:2]
     reduction = working_reduction(height, width)
     color = reduced(view.image[..., :3].float(), reduction) / FULL_SCALE.get(view.image.dtype, 1.0)
+    gain = torch.ones_like(color[0, 0]) if view.gain is None else view.gain.to(color)
     shown = torch.ones_like(color[..., :1], dtype=torch.bool)
     if view.mask is not None:
         shown &= reduced((view.mask.reshape(height, width, 1) != 0).to(color), reduction) == 1
     if layers is not None:
-        transmittance, addition = (reduced(layer.to(color), reduction) for layer in layers)
-        transmittance = transmittance.mean(dim=-1, keepdim=True)
+        transmittance, addition = layers
         shown &= transmittance >= MIN_SHOWN
-        color = ((color - addition) / transmittance.clamp_min(MIN_SHOWN)).clamp(0, 1)
-    return _Scene(color if view.gain is None else color / view.gain.to(color), shown, reduction)
+        color = color - (gain if artifact_is_exposed else 1.0) * addition
+        color = color / transmittance.clamp_min(MIN_SHOWN)
+    return _Scene((color / gain).clamp(0, 1), shown, reduction, group)
 
 
 def _pixels(positions: Tensor, view: View, scene: _Scene) -> tuple[Tensor, Tensor]:

@@ -35,6 +35,8 @@ class Artifacts(nn.Module):
     """[G, LENS_VALUES], their raw cameras; empty in checkpoints of the first version."""
     bare_keys: Tensor
     """[B, 6], cameras of the groups without an artifact."""
+    backdrop: Tensor
+    """[N, 7], distant points that the artifact hides (`DistantPoints.table`), until the scene gets them at the end."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -42,6 +44,7 @@ class Artifacts(nn.Module):
         self.register_buffer("camera_keys", torch.zeros(0, 6, dtype=torch.float64))
         self.register_buffer("lenses", torch.zeros(0, LENS_VALUES, dtype=torch.float64))
         self.register_buffer("bare_keys", torch.zeros(0, 6, dtype=torch.float64))
+        self.register_buffer("backdrop", torch.zeros(0, 7))
         self._keys: list[list[float]] = []
         self._bare: list[list[float]] = []
         self._group_of_view: list[int | None] = []
@@ -280,5 +283,7 @@ class Artifacts(nn.Module):
             state_dict.setdefault(prefix + name, getattr(self, name))
         if prefix + "camera_keys" in state_dict:  # nerfstudio also loads an empty state into the whole pipeline
             state_dict[f"{prefix}_extra_state"] = names_in(state_dict, prefix)
+            backdrop = state_dict.setdefault(f"{prefix}backdrop", self.backdrop[:0])  # earlier ones have none
+            self.backdrop = self.backdrop.new_zeros(backdrop.shape)
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
         self._remember_keys()

@@ -75,8 +75,6 @@ class SSASplatfactoModel(PhotoLosses):
         self.register_buffer("near_plane", torch.tensor(NEAR_PLANE))
         self.register_buffer("by_mcmc", torch.tensor(self.config.strategy == "mcmc"))
         self._near_plane, self._near_plane_is_set = NEAR_PLANE, False
-        self.backdrop: DistantPoints | None = None
-        """Distant points that no photo shows, for the end of the training."""
         self.metrics_every = 10
         self.strategy = make_strategy(self.config, vars(self.strategy), self.gauss_params)
         self.strategy_state = self.strategy.initialize_state(scene_scale=self.scene_scale)
@@ -149,8 +147,10 @@ class SSASplatfactoModel(PhotoLosses):
         learned = self.artifacts.learned()
         if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
-        if self.backdrop is not None:
-            seed_points.add_distant(self.backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
+        if len(self.artifacts.backdrop):
+            backdrop = DistantPoints.of_table(self.artifacts.backdrop)
+            seed_points.add_distant(backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
+            self.artifacts.backdrop = self.artifacts.backdrop[:0]  # a training that goes on has them already
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]
         """Load a checkpoint of any number of Gaussians, and its overlays.

@@ -115,15 +115,12 @@ class SSAPipeline(VanillaPipeline):
 
     def _add_distant_seeds(self, photos: list[dict[str, Any]]) -> None:
         model, cameras = self.model, self.datamanager.train_dataset.cameras
-        found = find_distant_seeds(model.config, model.artifacts, photos, cameras, self._points(), self._gains())
+        if self.config.artifacts_of:
+            return  # a resumed run has its checkpoint's
+        found = find_distant_seeds(model.config, model.artifacts, photos, cameras, self._points(), model.exposure)
         if found is not None:
-            shown, model.backdrop = found
-            if not self.config.artifacts_of:  # a resumed run has its checkpoint's Gaussians
-                add_distant(shown, model.gauss_params, model.config.sh_degree)
-
-    def _gains(self) -> torch.Tensor | None:
-        """Of the photos [V, 3], where their exposure is learned."""
-        return None if self.model.exposure is None else self.model.exposure.transforms.detach()[:, 0].exp()
+            add_distant(found[0], model.gauss_params, model.config.sh_degree)
+            model.artifacts.backdrop = found[1].table().to(model.device)
 
     def _set_budget(self) -> None:
         config, cameras = self.config.model, self.datamanager.train_dataset.cameras
@@ -206,9 +203,10 @@ class SSAPipeline(VanillaPipeline):
         if setting == "given":
             overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
-            views = self.datamanager.train_dataset.cameras
+            views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
+            gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
             learned = learned_overlays(
-                self.config.model, photos, names, views, self._points(), groups, sizes, self._gains(),
+                self.config.model, photos, names, views, self._points(), groups, sizes, gains,
                 lambda group: self._withheld_photos(keys[group]), self._faces(keys),
             )  # fmt: skip
             overlays = [each.overlay for each in learned]

@@ -15,6 +15,8 @@ HEIGHT, WIDTH = 60, 80
 K = torch.tensor([[70.0, 0.0, 40.0], [0.0, 70.0, 30.0], [0.0, 0.0, 1.0]])
 SIGHT = [None] * 7
 """Layers of seven views without an artifact."""
+ONE = [0] * 7
+"""Groups of seven views of one camera."""
 GROUND = torch.cartesian_prod(torch.linspace(-9, 9, 300), torch.tensor([1.0]), torch.linspace(1, 20, 500))
 """A plane below the cameras (y is down), dense in the frame's lower half."""
 
@@ -53,7 +55,7 @@ def errors(found: DistantPoints) -> Tensor:
 
 
 def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
-    found, _ = distant_points(GROUND, turning_views(), SIGHT)
+    found, _ = distant_points(GROUND, turning_views(), SIGHT, ONE)
     assert len(found.positions) > 200
     down = found.positions[:, 1] / found.positions.norm(dim=-1)
     assert down.max() < 0.1, "below the horizon the ground has points of its own"
@@ -65,13 +67,13 @@ def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
 
 
 def test_a_picture_that_stands_still_in_the_frame_is_not_far_away() -> None:
-    sky_seeds = len(distant_points(GROUND, turning_views(), SIGHT)[0])
-    assert len(distant_points(GROUND, turning_views(still=True), SIGHT)[0]) < 0.1 * sky_seeds
+    sky_seeds = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    assert len(distant_points(GROUND, turning_views(still=True), SIGHT, ONE)[0]) < 0.1 * sky_seeds
 
 
 def test_colors_are_those_behind_a_film() -> None:
     T, B = torch.full((HEIGHT, WIDTH, 1), 0.7), torch.full((HEIGHT, WIDTH, 3), 0.2)
-    found, _ = distant_points(GROUND, turning_views((T, B)), [(T, B)] * 7)
+    found, _ = distant_points(GROUND, turning_views((T, B)), [(T, B)] * 7, ONE)
     assert len(found.positions) > 200
     assert errors(found).mean() < 0.03
 
@@ -79,8 +81,8 @@ def test_colors_are_those_behind_a_film() -> None:
 def test_the_sky_goes_on_behind_a_panel_without_its_color() -> None:
     hiding = torch.where(torch.arange(WIDTH)[:, None] < 30, 0.02, 1.0).expand(HEIGHT, WIDTH, 1)
     panel = (hiding, (1 - hiding) * torch.tensor([0.9, 0.1, 0.1]))
-    found, hidden = distant_points(GROUND, turning_views(panel), [panel] * 7)
-    without, nothing = distant_points(GROUND, turning_views(), SIGHT)
+    found, hidden = distant_points(GROUND, turning_views(panel), [panel] * 7, ONE)
+    without, nothing = distant_points(GROUND, turning_views(), SIGHT, ONE)
     assert not len(nothing)
     assert len(hidden) > 0.15 * len(without)
     assert len(found) + len(hidden) == pytest.approx(len(without), rel=0.1)
@@ -100,21 +102,21 @@ def test_a_wall_without_points_is_not_far_away() -> None:
         views.append(View(sky(torch.stack([across / 5, y * 0, y * 0 + 1], dim=-1)), None, pose, K))
     # Its points are at the sides, and no wider than the wall is far.
     points = torch.tensor([[side * (3.0 + 0.1 * i), 0.0, wall_at] for i in range(30) for side in (-1, 1)])
-    assert not len(distant_points(points, views, SIGHT)[0])
+    assert not len(distant_points(points, views, SIGHT, ONE)[0])
 
 
 def test_masked_pixels_and_gains_count() -> None:
-    plain, _ = distant_points(GROUND, turning_views(), SIGHT)
+    plain, _ = distant_points(GROUND, turning_views(), SIGHT, ONE)
     gain = torch.tensor([0.5, 0.8, 1.0])
     views = [View((v.image * gain * 65535).to(torch.int32).to(torch.uint16), None, v.world_to_camera, K, gain)
              for v in turning_views()]  # fmt: skip
-    assert torch.allclose(distant_points(GROUND, views, SIGHT)[0].colors, plain.colors, atol=1e-3)
+    assert torch.allclose(distant_points(GROUND, views, SIGHT, ONE)[0].colors, plain.colors, atol=1e-3)
     nothing = [View(v.image, torch.zeros(HEIGHT, WIDTH), v.world_to_camera, K) for v in views]
-    assert not any(map(len, distant_points(GROUND, nothing, SIGHT)))
+    assert not any(map(len, distant_points(GROUND, nothing, SIGHT, ONE)))
 
 
 def test_two_views_are_too_few() -> None:
-    assert not any(map(len, distant_points(GROUND, turning_views()[:2], SIGHT[:2])))
+    assert not any(map(len, distant_points(GROUND, turning_views()[:2], SIGHT[:2], ONE[:2])))
 
 
 def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
@@ -124,6 +126,38 @@ def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
         View(v.image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(dim=(1, 3)), None, v.world_to_camera, small)
         for v in views[1::2]
     ]
-    found, _ = distant_points(GROUND, [*views[::2], *halves], SIGHT)
+    found, _ = distant_points(GROUND, [*views[::2], *halves], SIGHT, ONE)
     assert len(found.positions) > 100
     assert errors(found).mean() < 0.05
+
+
+def test_cameras_with_a_still_picture_each_have_no_sky_together() -> None:
+    """The mean over both would explain neither."""
+    views = turning_views(still=True)
+    other = [View(v.image.flip(1), None, v.world_to_camera, K) for v in views]
+    found, _ = distant_points(GROUND, [*views, *other], [None] * 14, [0] * 7 + [1] * 7)
+    assert len(found) < 0.1 * len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+
+
+@pytest.mark.parametrize("exposed", [True, False])
+def test_a_gain_acts_on_the_artifact_or_on_the_scene_alone(exposed: bool) -> None:
+    T, B = torch.full((HEIGHT, WIDTH, 1), 0.7), torch.full((HEIGHT, WIDTH, 3), 0.2)
+    gain = torch.tensor([0.6, 0.7, 0.9])
+    views = []
+    for v in turning_views():
+        photo = gain * (T * v.image + B) if exposed else T * gain * v.image + B
+        views.append(View(photo, None, v.world_to_camera, K, gain))
+    found, _ = distant_points(GROUND, views, [(T, B)] * 7, ONE, exposed)
+    assert len(found) > 200
+    assert errors(found).mean() < 0.03
+
+
+def test_far_hills_do_not_hide_a_sky() -> None:
+    """Where the scene's farthest points have no parallax, noise would decide between them and the sky."""
+    generator = torch.Generator().manual_seed(0)
+    views = [
+        View((v.image + 0.02 * torch.randn(v.image.shape, generator=generator)).clamp(0, 1), None, v.world_to_camera, K)
+        for v in turning_views()
+    ]
+    hills = torch.tensor([[0.0, 5.0, 300.0]]).expand(len(GROUND) // 49, 3)
+    assert len(distant_points(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200

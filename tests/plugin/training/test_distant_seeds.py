@@ -22,8 +22,8 @@ def stated_points(monkeypatch):
     """Calls of `distant_points`, which finds FOUND and HIDDEN."""
     calls = []
 
-    def distant_points(points, views, layers):
-        calls.append((points, views, layers))
+    def distant_points(points, views, layers, groups, exposed):
+        calls.append((points, views, layers, groups))
         return FOUND, HIDDEN
 
     monkeypatch.setattr(distant_seeds, "distant_points", distant_points)
@@ -46,9 +46,10 @@ def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
     assert model.num_points == plain.num_points + 2
     torch.testing.assert_close(model.means[-2:].detach(), FOUND.positions)
     assert model.opacities[-1].item() == pytest.approx(model.opacities[0].item())
-    [(points, views, layers)] = stated_points
+    [(points, views, layers, groups)] = stated_points
     assert len(points) == plain.num_points
     assert len(views) == len(layers) == 12
+    assert groups == [0] * 12
     assert [tuple(layer.shape) for layer in layers[0]] == [(48, 64, 1), (48, 64, 3)]
 
     settings = {"num_downscales": 0, "overlay": "on", "strategy": strategy}
@@ -61,12 +62,29 @@ def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
     assert trained.scales[-1].tolist() == pytest.approx([math.log(HIDDEN.spacing)] * 3)
     torch.testing.assert_close(trained.colors[-1].detach(), HIDDEN.colors[0])
 
-    # A resumed run has the checkpoint's, starts from no others, and trains on.
+    # A training that goes on has them already.
     longer = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "longer", 6, settings)
     longer.load_dir = path.parent / "nerfstudio_models"
     _, pipeline, _ = train_and_evaluate(longer)
-    assert pipeline.model.num_points == trained.num_points + 1
+    assert pipeline.model.num_points == trained.num_points
     assert all(torch.isfinite(values).all() for values in pipeline.model.gauss_params.values())
+
+
+def test_a_run_that_was_stopped_ends_with_its_backdrop(
+    tiny_scene, tmp_path, configure_training, train_and_evaluate, stated_points
+) -> None:
+    settings = {"num_downscales": 0, "overlay": "on"}
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 3, settings)
+    trainer = config.setup(local_rank=0, world_size=1)
+    trainer.setup()
+    before = trainer.pipeline.model.num_points
+    trainer.save_checkpoint(0)
+    resumed = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "resumed", 3, settings)
+    resumed.load_dir = trainer.checkpoint_dir
+    _, pipeline, _ = train_and_evaluate(resumed)
+    assert len(stated_points) == 1
+    assert pipeline.model.num_points == before + 1
+    torch.testing.assert_close(pipeline.model.means[-1].detach(), HIDDEN.positions[0])
 
 
 @pytest.mark.parametrize("settings", [{"overlay": "off"}, {"overlay": "on", "overlay_start": "statistics"}])
