@@ -10,9 +10,13 @@ def is_interrupt(error: BaseException) -> bool:
     """Whether an error is ctrl+c.
 
     A function of numba's returns its result all the same. CPython then raises SystemError ("returned a result with an
-    exception set") with the interrupt as its cause.
+    exception set") with the interrupt as its cause; or as the cause of its cause, where each of two calls in each other
+    does so.
     """
-    return isinstance(error.__cause__ if isinstance(error, SystemError) else error, KeyboardInterrupt)
+    source: BaseException | None = error
+    while isinstance(source, SystemError):
+        source = source.__cause__
+    return isinstance(source, KeyboardInterrupt)
 
 
 @contextmanager

@@ -20,6 +20,14 @@ def test_an_interrupt_within_a_compiled_function_is_one():
         compiled()
 
 
+def test_an_interrupt_within_two_compiled_functions_is_one():
+    with pytest.raises(KeyboardInterrupt), ctrl_c.unwrapped():
+        try:
+            compiled()
+        except SystemError as inner:
+            raise SystemError("CPUDispatcher(g) returned a result with an exception set") from inner
+
+
 @pytest.mark.parametrize(
     "error", [SystemError("bad argument to internal function"), ValueError("x"), KeyboardInterrupt()]
 )
