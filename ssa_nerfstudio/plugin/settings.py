@@ -59,8 +59,8 @@ class ModelSettings(SplatfactoModelConfig):
     the photos teach the scene nothing; False: they do."""
     distant_seeds: bool = True
     """Where an overlay is trained with overlay_start "points", or given: start also from Gaussians far away in
-    directions in which structure from motion has found no points, such as a sky, and the photos agree on a color, and end
-    with a backdrop where the artifact hides such a sky from all photos; False: from its points alone. Not with
+    directions in which structure from motion has found no points, such as a sky, and the photos agree on a color; and
+    end with a backdrop where the artifact hides such a sky from all photos. False: from its points alone. Not with
     random_init."""
     strategy: Literal["auto", "adc", "mcmc"] = "auto"
     """Densification. adc: adaptive density control, splatfacto's; mcmc: up to a fixed number of Gaussians, cap_max;

@@ -20,12 +20,17 @@ def test_an_interrupt_within_a_compiled_function_is_one():
         compiled()
 
 
-def test_an_interrupt_within_two_compiled_functions_is_one():
+def nested() -> None:
+    """The same of two compiled functions, one in the other."""
+    try:
+        compiled()
+    except SystemError as inner:
+        raise SystemError("CPUDispatcher(g) returned a result with an exception set") from inner
+
+
+def test_an_interrupt_within_nested_compiled_functions_is_one():
     with pytest.raises(KeyboardInterrupt), ctrl_c.unwrapped():
-        try:
-            compiled()
-        except SystemError as inner:
-            raise SystemError("CPUDispatcher(g) returned a result with an exception set") from inner
+        nested()
 
 
 @pytest.mark.parametrize(
