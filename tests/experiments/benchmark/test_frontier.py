@@ -82,11 +82,9 @@ def test_prices_add_up_to_what_the_frontier_costs(cloud):
     assert all(step.more >= 0 and step.end == pytest.approx(step.start + 1) for step in steps)
     if steps:
         assert steps[-1].end == pytest.approx(front[-1].quality)
-        # The last point but one may be as good, up to rounding.
-        reached = [point.seconds for point in front if point.quality == pytest.approx(front[-1].quality)]
-        assert steps[-1].seconds in reached
+        assert steps[-1].seconds == front[-1].seconds
         started = steps[0].seconds - steps[0].more
-        assert sum(step.more for step in steps) == pytest.approx(steps[-1].seconds - started)
+        assert sum(step.more for step in steps) == pytest.approx(front[-1].seconds - started)
         assert steps[0].start - front[0].quality < 1
 
 

@@ -85,5 +85,7 @@ def price(front: Sequence[Point], size: float = 1.0) -> list[Step]:
     best = front[-1].quality
     count = int((best - front[0].quality) / size + 1e-9)
     levels = [best - size * k for k in range(count, -1, -1)]
-    reached = [next(p.seconds for p in front if p.quality >= level - 1e-9) for level in levels]
+    # Levels but the best are rounded; the best is the last point's, even where one before is as good up to rounding.
+    reached = [next(p.seconds for p in front if p.quality >= level - 1e-9) for level in levels[:-1]]
+    reached.append(front[-1].seconds)
     return [Step(levels[k], levels[k + 1], reached[k + 1], reached[k + 1] - reached[k]) for k in range(len(levels) - 1)]
