@@ -21,9 +21,11 @@ from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.point_samples import (
     OCCLUSION_RADIUS,
     View,
+    order_by_point,
     project,
     regular_subset,
     summed,
+    working_pixels,
     working_reduction,
 )
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
@@ -110,14 +112,14 @@ def distant_points(
     radius = DISTANCE * nearer[-1]
     of_views = {id(pair): _reduced_layers(pair, view) for pair, view in zip(layers, views, strict=True) if pair}
     scenes = [
-        _scene_in(view, of_views.get(id(pair)), group, artifact_is_exposed)
-        for view, pair, group in zip(views, layers, groups, strict=True)
+        _scene_in(view, of_views.get(id(pair)), artifact_is_exposed) for view, pair in zip(views, layers, strict=True)
     ]
     angles = [scene.reduction / float(view.intrinsics[0, 0]) for scene, view in zip(scenes, views, strict=True)]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
     taken = [_near_points(points, view, scene) for view, scene in zip(views, scenes, strict=True)]
-    far = _explanation(center + radius * directions, views, scenes, taken)
+    frames = list(zip(views, scenes, taken, _still_pictures(scenes, groups), strict=True))
+    far = _explanation(center + radius * directions, frames)
     shown = far.shown >= MIN_SIGHTS
     likely = shown & (far.sights >= MIN_SIGHTS) & (2 * far.sights >= far.shown) & (far.residual <= far.still)
     candidates = likely.nonzero()[:, 0]
@@ -125,7 +127,7 @@ def distant_points(
         nothing = DistantPoints(directions[:0], directions[:0], radius * angle)
         return nothing, nothing
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
-    alternatives = [_explanation(center + at * directions[candidates], views, scenes, taken) for at in nearer]
+    alternatives = [_explanation(center + at * directions[candidates], frames) for at in nearer]
     area = _connected(directions[candidates], 1.5 * angle)
     count = int(area.max()) + 1
     comparable = torch.ones_like(candidates, dtype=torch.bool)
@@ -157,8 +159,6 @@ class _Scene:
     """[h, w, 1] bool: no mask and no opaque artifact is there."""
     reduction: int
     """Photo pixels a working pixel."""
-    group: int
-    """Of its view."""
 
 
 @dataclass(frozen=True)
@@ -177,22 +177,6 @@ class _Explanation:
     """[N] int64: views that show a point."""
     in_frame: Tensor
     """[N] int64: views with a point in the frame."""
-
-
-class _Means:
-    """Mean over the photos of one group and size, pixel by pixel."""
-
-    def __init__(self, scenes: Sequence[_Scene]) -> None:
-        self._sums: dict[tuple[int, torch.Size], Tensor] = {}
-        for scene in scenes:
-            total = torch.cat([scene.color * scene.shown, scene.shown.to(scene.color)], dim=-1)
-            key = scene.group, scene.shown.shape
-            self._sums[key] = self._sums.get(key, 0) + total
-
-    def of(self, scene: _Scene) -> Tensor:
-        """[h w, 3], of the photos of a scene's group."""
-        total = self._sums[scene.group, scene.shown.shape].reshape(-1, 4)
-        return total[:, :3] / total[:, 3:].clamp_min(1)
 
 
 def _members(groups: Sequence[int], group: int) -> list[int]:
@@ -221,7 +205,7 @@ def _reduced_layers(layers: tuple[Tensor, Tensor], view: View) -> tuple[Tensor, 
     return transmittance.mean(dim=-1, keepdim=True), addition
 
 
-def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, group: int, artifact_is_exposed: bool) -> _Scene:
+def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, artifact_is_exposed: bool) -> _Scene:
     height, width = view.image.shape[:2]
     reduction = working_reduction(height, width)
     color = reduced(view.image[..., :3].float(), reduction) / FULL_SCALE.get(view.image.dtype, 1.0)
@@ -234,17 +218,26 @@ def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, group: int, arti
         shown &= transmittance >= MIN_SHOWN
         color = color - (gain if artifact_is_exposed else 1.0) * addition
         color = color / transmittance.clamp_min(MIN_SHOWN)
-    return _Scene((color / gain).clamp(0, 1), shown, reduction, group)
+    return _Scene((color / gain).clamp(0, 1), shown, reduction)
+
+
+def _still_pictures(scenes: Sequence[_Scene], groups: Sequence[int]) -> list[Tensor]:
+    """For each scene the mean over those of its group and size, [h w, 3]."""
+    keys = [(group, scene.shown.shape) for scene, group in zip(scenes, groups, strict=True)]
+    totals: dict[tuple[int, torch.Size], Tensor] = {}
+    for key, scene in zip(keys, scenes, strict=True):
+        total = torch.cat([scene.color * scene.shown, scene.shown.to(scene.color)], dim=-1).reshape(-1, 4)
+        totals[key] = totals[key] + total if key in totals else total
+    means = {key: total[:, :3] / total[:, 3:].clamp_min(1) for key, total in totals.items()}
+    return [means[key] for key in keys]
 
 
 def _pixels(positions: Tensor, view: View, scene: _Scene) -> tuple[Tensor, Tensor]:
     """Indices [M] of the positions [N, 3] in the frame of a view, and their working pixels [M], row by row."""
     height, width = scene.shown.shape[:2]
-    reduction = scene.reduction
-    lens = view.intrinsics[None]
-    _, index, position, _ = project(positions, view.world_to_camera[None], lens, height * reduction, width * reduction)
-    x, y = (position / reduction).long().unbind(dim=-1)
-    return index, y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
+    size = height * scene.reduction, width * scene.reduction
+    _, index, position, _ = project(positions, view.world_to_camera[None], view.intrinsics[None], *size)
+    return index, working_pixels(position, (height, width), scene.reduction)
 
 
 def _near_points(points: Tensor, view: View, scene: _Scene) -> Tensor:
@@ -256,20 +249,23 @@ def _near_points(points: Tensor, view: View, scene: _Scene) -> Tensor:
     return nn.functional.max_pool2d(taken.reshape(1, height, width), side, 1, OCCLUSION_RADIUS).flatten() > 0
 
 
-def _explanation(
-    positions: Tensor, views: Sequence[View], scenes: Sequence[_Scene], taken: Sequence[Tensor]
-) -> _Explanation:
-    count, means, sights = len(positions), _Means(scenes), []
-    for view, scene, near in zip(views, scenes, taken, strict=True):
+def _explanation(positions: Tensor, frames: Sequence[tuple[View, _Scene, Tensor, Tensor]]) -> _Explanation:
+    """How well one color for each of the positions [N, 3] explains the photos.
+
+    Args:
+        positions: world units.
+        frames: of each view what it shows, what is `_near_points`, and its picture of `_still_pictures`.
+    """
+    count, sights = len(positions), []
+    for view, scene, near, picture in frames:
         index, pixel = _pixels(positions, view, scene)
-        color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (scene.color, means.of(scene)))
+        color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (scene.color, picture))
         shown = scene.shown.flatten().to(positions.device)[pixel]
         sights.append((index, color, still, shown, shown & ~near[pixel]))
     index, color, still, shown, free = (torch.cat(each) for each in zip(*sights, strict=True))
     in_frame, shown = torch.bincount(index, minlength=count), torch.bincount(index[shown], minlength=count)
     index, color, still = index[free], color[free], still[free]
-    order = torch.argsort(color.sum(dim=-1))
-    order = order[torch.argsort(index[order], stable=True)]
+    order = order_by_point(index, color)
     index, color, still = index[order], color[order], still[order]
     sights = torch.bincount(index, minlength=count)
     middle = sights.cumsum(0) - sights + sights // 2

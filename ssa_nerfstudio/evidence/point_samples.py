@@ -68,8 +68,7 @@ class PointSamples:
 
     def ordered(self) -> PointSamples:
         """Sorted by point, then by brightness."""
-        order = torch.argsort(self.color.sum(dim=-1))
-        order = order[torch.argsort(self.point[order], stable=True)]
+        order = order_by_point(self.point, self.color)
         point, pixel, color, view = (each[order] for each in (self.point, self.pixel, self.color, self.view))
         patch = None if self.patch is None else self.patch[order]
         return replace(self, point=point, pixel=pixel, color=color, view=view, patch=patch)
@@ -212,6 +211,20 @@ def project(
     return camera, point, position[camera, point], depth[camera, point]
 
 
+def working_pixels(position: Tensor, size: tuple[int, int], reduction: int) -> Tensor:
+    """Working pixels [M], row by row, of x and y [M, 2] in photo pixels; size: height, width of the working frame."""
+    height, width = size
+    x, y = (position / reduction).long().unbind(dim=-1)
+    # A GPU multiplies by 1 / reduction, rounded, which may bring a position to the frame's edge.
+    return y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
+
+
+def order_by_point(point: Tensor, color: Tensor) -> Tensor:
+    """Order of samples of points [S], of these colors [S, 3]: by point, then by brightness."""
+    order = torch.argsort(color.sum(dim=-1))
+    return order[torch.argsort(point[order], stable=True)]
+
+
 def _matched(color: Tensor, here: Tensor, there: Tensor) -> Tensor:
     """Colors [M, 3] with mean and deviation [M, 4 or more] from there brought to those here."""
     # A gray level, because photos are rounded.
@@ -272,9 +285,7 @@ def _visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[
         some = views[first : first + VIEWS_AT_ONCE]
         poses, lenses = torch.stack([v.world_to_camera for v in some]), torch.stack([v.intrinsics for v in some])
         view, point, position, depth = project(points, poses, lenses, height * reduction, width * reduction)
-        x, y = (position / reduction).long().unbind(dim=-1)
-        # A GPU multiplies by 1 / reduction, rounded, which may bring a position to the frame's edge.
-        pixel = y.clamp_max(height - 1) * width + x.clamp_max(width - 1)
+        pixel = working_pixels(position, size, reduction)
         place = view * (height * width) + pixel
         nearest = torch.full((len(some) * height * width,), torch.inf, device=points.device, dtype=depth.dtype)
         nearest = nearest.scatter_reduce(0, place, depth, "amin").reshape(-1, height, width)

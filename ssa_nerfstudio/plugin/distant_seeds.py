@@ -40,7 +40,7 @@ def find_distant_seeds(
     wanted = config.distant_seeds and config.overlay_start == "points" and not config.random_init
     if not wanted or not len(artifacts) or points is None or not len(points):
         return None
-    gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
+    gains = None if exposure is None else exposure.gains()
     views = views_of(photos, cameras, gains)
     of_groups = [artifacts[group].layers() for group in range(len(artifacts))]
     own = [artifacts.group_of_view(view) for view in range(len(views))]

@@ -64,6 +64,10 @@ class Exposure(nn.Module):
         log_gain, offset = self.transforms[view].unbind()
         return PhotoExposure(log_gain.exp(), offset)
 
+    def gains(self) -> Tensor:
+        """Of all photos [V, 3], without a gradient."""
+        return self.transforms.detach()[:, 0].exp()
+
     @torch.no_grad()
     def project(self) -> None:
         """Subtract the means over the photos: the gains' geometric mean becomes 1, the offsets' mean 0."""

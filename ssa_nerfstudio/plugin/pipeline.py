@@ -204,7 +204,7 @@ class SSAPipeline(VanillaPipeline):
             overlays = given_overlays(self.config.model.overlay_given, sizes)
         else:
             views, exposure = self.datamanager.train_dataset.cameras, self.model.exposure
-            gains = None if exposure is None else exposure.transforms.detach()[:, 0].exp()
+            gains = None if exposure is None else exposure.gains()
             learned = learned_overlays(
                 self.config.model, photos, names, views, self._points(), groups, sizes, gains,
                 lambda group: self._withheld_photos(keys[group]), self._faces(keys),
