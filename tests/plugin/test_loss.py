@@ -98,7 +98,7 @@ def test_overlays_weigh_as_much_as_the_photos_that_show_them(model, groups):
     with torch.no_grad():
         other.alpha_logits.add_(3)
     of_views = [groups[view % len(groups)] for view in range(model.num_train_data)]
-    model.artifacts, count = Artifacts(), 1 + max(groups)
+    model.artifacts, count = Artifacts().to(model.device), 1 + max(groups)
     model.artifacts.assign([own, other, None][:count], torch.zeros(count, 6), of_views, torch.zeros(count, LENS_VALUES))
     first, second = (of_views.count(group) / len(of_views) for group in (0, 1))
     expected = weight * sparsity_loss(other.opacity(), other.evidence, "log")

@@ -44,7 +44,7 @@ def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
     assert not stated_points
     model = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy)
     assert model.num_points == plain.num_points + 2
-    torch.testing.assert_close(model.means[-2:].detach(), FOUND.positions)
+    torch.testing.assert_close(model.means[-2:].detach().cpu(), FOUND.positions)
     assert model.opacities[-1].item() == pytest.approx(model.opacities[0].item())
     [(points, views, layers, groups)] = stated_points
     assert len(points) == plain.num_points
@@ -57,10 +57,10 @@ def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
     _, pipeline, path = train_and_evaluate(config)
     trained = pipeline.model
     assert trained.num_points == plain.num_points + 3, "too few steps for a refinement"
-    torch.testing.assert_close(trained.means[-1].detach(), HIDDEN.positions[0])
+    torch.testing.assert_close(trained.means[-1].detach().cpu(), HIDDEN.positions[0])
     assert trained.opacities[-1].sigmoid().item() == pytest.approx(0.99)
     assert trained.scales[-1].tolist() == pytest.approx([math.log(HIDDEN.spacing)] * 3)
-    torch.testing.assert_close(trained.colors[-1].detach(), HIDDEN.colors[0])
+    torch.testing.assert_close(trained.colors[-1].detach().cpu(), HIDDEN.colors[0])
 
     # A training that goes on has them already.
     longer = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "longer", 6, settings)
@@ -84,7 +84,7 @@ def test_a_run_that_was_stopped_ends_with_its_backdrop(
     _, pipeline, _ = train_and_evaluate(resumed)
     assert len(stated_points) == 1
     assert pipeline.model.num_points == before + 1
-    torch.testing.assert_close(pipeline.model.means[-1].detach(), HIDDEN.positions[0])
+    torch.testing.assert_close(pipeline.model.means[-1].detach().cpu(), HIDDEN.positions[0])
 
 
 @pytest.mark.parametrize("settings", [{"overlay": "off"}, {"overlay": "on", "overlay_start": "statistics"}])
