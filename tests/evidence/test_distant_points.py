@@ -161,3 +161,14 @@ def test_far_hills_do_not_hide_a_sky() -> None:
     ]
     hills = torch.tensor([[0.0, 5.0, 300.0]]).expand(len(GROUND) // 49, 3)
     assert len(distant_points(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200
+
+
+@pytest.mark.parametrize(("side", "found"), [(24, True), (9, False)])
+def test_a_gap_between_points_is_no_sky_unless_it_is_wide(side: int, found: bool) -> None:
+    """Of a few directions one distance is the best by chance, and splats grow into them."""
+    across, up = torch.meshgrid(torch.arange(-90, 90) / 140, torch.arange(-60, 4) / 140, indexing="ij")
+    hole = (across.abs() < side / 140) & ((up + 0.2).abs() < side / 140)
+    leaves = 20 * torch.stack([across, up, torch.ones_like(up)], dim=-1)[~hole]
+    seeds, _ = distant_points(torch.cat([GROUND[::5], leaves]), turning_views(), SIGHT, ONE)
+    assert (len(seeds) > 10) == found
+    assert found or not len(seeds)
