@@ -89,14 +89,14 @@ def update(command: Command, name: str, benchmark: Benchmark, planned: list[Run]
     runs = bench.select(planned, command.scenes, command.only)
     place = bench.reach(command.output)
     console = plain_console()
-    if command.list:
-        done = {result.run.id: result.status for result in read_all([command.output])[0]}
-        for run in runs:
-            print(f"{done.get(run.id, 'to do'):<9} {run.id}")
-        return [], []
     for folder in command.merge:
         if not (folder / "results").is_dir():
             raise InputError(f"--merge {folder} holds no results", "name the --output folder of another ssa bench")
+    if command.list:
+        done = {result.run.id: result.status for result in read_all([command.output, *command.merge])[0]}
+        for run in runs:
+            print(f"{done.get(run.id, 'to do'):<9} {run.id}")
+        return [], []
     if command.prepare_only:
         check_captures(runs, place.scenes, place.artifacts)
     else:

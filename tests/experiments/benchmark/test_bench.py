@@ -123,7 +123,11 @@ def test_a_model_that_cannot_be_kept_fails_its_run_and_a_kept_one_is_found_by_ne
 def test_results_of_other_folders_are_taken_over(tmp_path, capsys):
     runs = plan(read_benchmark("smoke"))
     folder_of(tmp_path / "there", [result(run) for run in runs])
-    main(["bench", "smoke", "--output", str(tmp_path / "here"), "--merge", str(tmp_path / "there")])
+    taken_over = ["bench", "smoke", "--output", str(tmp_path / "here"), "--merge", str(tmp_path / "there")]
+    main([*taken_over, "--list"])
+    assert capsys.readouterr().out.count("finished") == 5
+    assert not (tmp_path / "here").exists()
+    main(taken_over)
     assert "All smoke runs" in capsys.readouterr().out
     assert len(read_all([tmp_path / "here"])[0]) == 5
 
