@@ -17,7 +17,6 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.point_samples import (
     OCCLUSION_RADIUS,
@@ -39,8 +38,9 @@ DISTANCE = 3.0
 """Of the distant points, relative to that of the 99th percentile of the scene's points, from the cameras' mean."""
 NEARER = (0.5, 0.9, 0.99)
 """Quantiles of the scene's points whose distances are the alternatives: there are the scene's surfaces."""
-MIN_AREA = (2 * DETAIL_RADIUS + 1) ** 2
-"""Working pixels of an area at least, of directions that can be compared; see `_distant`."""
+MIN_DIRECTIONS = 30
+"""Of an area that can be compared with nearer distances; see `_distant`. On five captures patches that are far away by
+chance have at most 21, skies at least 39."""
 MIN_SIGHTS = 3
 """Views that must see a direction: the fewest of which a median leaves one out."""
 MAX_VIEWS = 128
@@ -117,9 +117,8 @@ def distant_points(
     scenes = [
         _scene_in(view, of_views.get(id(pair)), artifact_is_exposed) for view, pair in zip(views, layers, strict=True)
     ]
-    pixels = [scene.reduction / float(view.intrinsics[0, 0]) for scene, view in zip(scenes, views, strict=True)]
-    pixel = sum(pixels) / len(pixels)  # radians
-    angle = max(SPACING * pixel, math.sqrt(4 * math.pi / MAX_DIRECTIONS))
+    angles = [scene.reduction / float(view.intrinsics[0, 0]) for scene, view in zip(scenes, views, strict=True)]
+    angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
     taken = [_near_points(points, view, scene) for view, scene in zip(views, scenes, strict=True)]
     frames = list(zip(views, scenes, taken, _still_pictures(scenes, groups), strict=True))
@@ -132,9 +131,9 @@ def distant_points(
         return nothing, nothing
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
     alternatives = [_explanation(center + at * directions[candidates], frames) for at in nearer]
-    areas, smallest = _connected(directions[candidates], 1.5 * angle), MIN_AREA * (pixel / angle) ** 2
+    areas = _connected(directions[candidates], 1.5 * angle)
     found = torch.zeros_like(shown)
-    found[candidates[_distant(areas, far.residual[candidates], alternatives, smallest)]] = True
+    found[candidates[_distant(areas, far.residual[candidates], alternatives)]] = True
     behind = ((far.in_frame >= MIN_SIGHTS) & ~shown).nonzero()[:, 0]
     seen = shown.nonzero()[:, 0]
     _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[behind].cpu().numpy())
@@ -176,17 +175,16 @@ class _Explanation:
     """[N] int64: views with a point in the frame."""
 
 
-def _distant(area: Tensor, far: Tensor, alternatives: Sequence[_Explanation], smallest: float) -> Tensor:
+def _distant(area: Tensor, far: Tensor, alternatives: Sequence[_Explanation]) -> Tensor:
     """Whether directions are of a connected area that is explained better far away than at any alternative, bool [N].
 
-    Only directions that can be compared with all alternatives count. Of few one distance is the best by chance, as on
-    a plain wall; and a small area needs no points of its own, because splats grow into it from beside it.
+    Only directions that MIN_SIGHTS views see at every alternative count. Among few directions one distance is the best
+    by chance, as on a plain wall; and a small area needs no points, because splats grow into it from beside it.
 
     Args:
         area: number of each direction's area [N].
         far: their residuals far away, [N].
         alternatives: the directions nearer by; none where nothing has parallax.
-        smallest: number of directions that an area has at least.
     """
     comparable = torch.ones_like(area, dtype=torch.bool)
     for other in alternatives:
@@ -194,7 +192,7 @@ def _distant(area: Tensor, far: Tensor, alternatives: Sequence[_Explanation], sm
     values = torch.stack([torch.ones_like(far), far, *(other.residual for other in alternatives)], dim=-1)
     totals = summed(area, torch.where(comparable[:, None], values, 0), int(area.max()) + 1)
     size, far_away, nearer = totals.split((1, 1, len(alternatives)), dim=1)
-    return ((size[:, 0] >= smallest) & (far_away < nearer).all(dim=1))[area]
+    return ((size[:, 0] >= MIN_DIRECTIONS) & (far_away < nearer).all(dim=1))[area]
 
 
 def _members(groups: Sequence[int], group: int) -> list[int]:

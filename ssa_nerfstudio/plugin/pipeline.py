@@ -121,6 +121,11 @@ class SSAPipeline(VanillaPipeline):
         if found is not None:
             add_distant(found[0], model.gauss_params, model.config.sh_degree)
             model.artifacts.backdrop = found[1].table().to(model.device)
+            if len(found[0]):
+                tell(
+                    f"The scene also starts from {len(found[0]):,} distant points, where the photos show a sky or the "
+                    "like and the dataset has none. (--pipeline.model.distant-seeds False leaves them out.)"
+                )
 
     def _set_budget(self) -> None:
         config, cameras = self.config.model, self.datamanager.train_dataset.cameras

@@ -8,7 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.distant_points import DistantPoints, distant_points
+from ssa_nerfstudio.evidence import distant_points as distant_points_module
+from ssa_nerfstudio.evidence.distant_points import (
+    MIN_DIRECTIONS,
+    DistantPoints,
+    _distant,
+    _Explanation,
+    distant_points,
+)
 from ssa_nerfstudio.evidence.point_samples import View
 
 HEIGHT, WIDTH = 60, 80
@@ -163,12 +170,46 @@ def test_far_hills_do_not_hide_a_sky() -> None:
     assert len(distant_points(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200
 
 
-@pytest.mark.parametrize(("side", "found"), [(24, True), (9, False)])
+@pytest.mark.parametrize(("side", "found"), [(24, True), (16, False)])
 def test_a_gap_between_points_is_no_sky_unless_it_is_wide(side: int, found: bool) -> None:
-    """Of a few directions one distance is the best by chance, and splats grow into them."""
+    """Splats grow into a small one from beside it."""
     across, up = torch.meshgrid(torch.arange(-90, 90) / 140, torch.arange(-60, 4) / 140, indexing="ij")
     hole = (across.abs() < side / 140) & ((up + 0.2).abs() < side / 140)
     leaves = 20 * torch.stack([across, up, torch.ones_like(up)], dim=-1)[~hole]
     seeds, _ = distant_points(torch.cat([GROUND[::5], leaves]), turning_views(), SIGHT, ONE)
-    assert (len(seeds) > 10) == found
+    assert (len(seeds) >= MIN_DIRECTIONS) == found
     assert found or not len(seeds)
+
+
+def explanation(residual: Tensor, sights: Tensor | int = 9) -> _Explanation:
+    """Of directions with these residuals [N], seen by so many views."""
+    seen = torch.as_tensor(sights).expand(len(residual))
+    return _Explanation(torch.zeros(len(residual), 3), residual, residual, seen, seen, seen)
+
+
+def test_an_area_is_compared_where_enough_views_see_all_alternatives() -> None:
+    """Four areas of 40 directions: far away, nearer by, and two of which too few can be compared with the second."""
+    area = torch.arange(4).repeat_interleave(40)
+    far = torch.tensor([0.1, 0.3, 0.1, 0.1])[area]
+    first = explanation(torch.full((160,), 0.2))
+    sights = torch.full((160,), 9)
+    sights[80 + MIN_DIRECTIONS - 1 : 120] = 2
+    sights[120:] = 0
+    # Where few views see it, a nearer distance explains them by chance.
+    second = explanation(torch.where(sights < 3, 0.0, 0.2), sights)
+    assert _distant(area, far, [first, second]).reshape(4, 40).all(dim=1).tolist() == [True, False, False, False]
+    assert _distant(area, far, [first]).reshape(4, 40).all(dim=1).tolist() == [True, False, True, True]
+    assert _distant(area, far, []).all(), "nothing speaks against it"
+    sights[80 : 80 + MIN_DIRECTIONS] = 9
+    second = explanation(torch.where(sights < 3, 0.0, 0.2), sights)
+    assert _distant(area, far, [first, second])[80:120].all(), "directions that cannot be compared say nothing"
+
+
+def test_few_directions_of_a_long_lens_are_too_few_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its directions are farther apart than two pixels, and as few of them are far away by chance."""
+    found = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    monkeypatch.setattr(distant_points_module, "MAX_DIRECTIONS", 4000)
+    wider = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    assert MIN_DIRECTIONS < wider < 0.5 * found
+    monkeypatch.setattr(distant_points_module, "MAX_DIRECTIONS", 800)
+    assert not len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])

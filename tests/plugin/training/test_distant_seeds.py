@@ -38,12 +38,15 @@ def started(scene, folder, configure_training, **settings):
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
 def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
-    tiny_scene, tmp_path, configure_training, train_and_evaluate, stated_points, strategy: str
+    tiny_scene, tmp_path, configure_training, train_and_evaluate, stated_points, caplog, strategy: str
 ) -> None:
+    caplog.set_level("INFO")
     plain = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy, distant_seeds=False)
     assert not stated_points
+    assert "distant points" not in caplog.text
     model = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy)
     assert model.num_points == plain.num_points + 2
+    assert "starts from 2 distant points" in caplog.text
     torch.testing.assert_close(model.means[-2:].detach().cpu(), FOUND.positions)
     assert model.opacities[-1].item() == pytest.approx(model.opacities[0].item())
     [(points, views, layers, groups)] = stated_points
