@@ -2,9 +2,9 @@
 
 There are no clean views to compare with, only an approximate mask of the artifact in the raw frame, white on the
 artifact. It is compared in the undistorted frame. The mean matte of the frame's upper third is printed, too: there is
-sky, which hardly changes from view to view and must not become artifact. With --beside-off also what the overlay costs
-elsewhere: whatever stays in its place in every photo, as a car ahead does, is an artifact to it, and a part of the test
-photos.
+sky, which hardly changes from view to view and must not become artifact. With --beside-off also a training without an
+overlay, compared outside the mask: whatever stays in its place in every photo, as a car ahead does, the overlay takes,
+but test photos show it. Distant seeds come with the overlay; distant_seeds=False among the settings leaves them out.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class Command:
     steps: Count = 30_000
     """Training steps; every schedule is scaled to them."""
     scale_factor: Factor = 1.0
-    """Photos are resized by this."""
+    """Training photos are resized by this; test photos keep their size."""
     settings: tuple[str, ...] = ()
     """Settings of the model as name=value, for example overlay_start=statistics."""
     beside_off: bool = False
@@ -73,12 +73,14 @@ class Command:
         Raises:
             InputError: the dataset has no mask, or cannot be trained on.
         """
+        if self.beside_off and "overlay=off" in self.settings:
+            raise InputError("--beside-off: --settings state overlay=off", "leave one of them out")
         if not (self.data / MASK).is_file():
             raise InputError(f"{self.data / MASK} does not exist", "name a dataset with a mask of its artifact")
-        from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
-        from ssa_nerfstudio.experiments.runs.training_run import evaluate
-
         region = ArtifactRegion.read(self.data / MASK, Dataset.read(self.data, eval_interval=8).views[0].lens)
+        if not (region.inside.any() and region.outside.any()):
+            where = "inside" if region.outside.any() else "outside"
+            raise InputError(f"{self.data / MASK} leaves no pixel {where}", "give a mask that is white on the artifact")
         outcome, pipeline = self._train(region)
         row = [f"{self.method} {' '.join(self.settings)}".strip(), f"PSNR {outcome.metrics['psnr']:.2f}"]
         mattes = [overlay.matte().detach().cpu()[..., 0] for overlay in pipeline.model.artifacts.learned()]
@@ -88,16 +90,26 @@ class Command:
             row += [f"{name.replace('_', ' ')} {value:.3f}" for name, value in region.mattes(matte).items()]
         print("; ".join(row))
         if self.beside_off:
-            shown = replace(region, outside=region.outside & ~hidden_by(mattes, region.outside.shape))
-            print(f"hidden outside the mask {1 - float(shown.outside.sum() / region.outside.sum()):.1%}")
-            off, without = self._train(region, "overlay=off")
-            shown_by_both = (evaluate(each, FlipProcesses(1), shown) for each in (without, pipeline))
-            print("| outside the mask, dB | off | with an overlay |", "|---|---|---|", sep="\n")
-            for where, views in (
-                ("everywhere", (off.views, outcome.views)),
-                ("where the overlay hides less than half", shown_by_both),
-            ):
-                print(f"| {where} | {' | '.join(map(outside, views))} |")
+            self._compare(region, outcome, pipeline, mattes)
+
+    def _compare(
+        self, region: ArtifactRegion, outcome: Outcome, pipeline: SSAPipeline, mattes: Sequence[Tensor]
+    ) -> None:
+        """Train without an overlay and print the PSNR of both outside the mask."""
+        from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
+        from ssa_nerfstudio.experiments.runs.training_run import evaluate
+
+        if not mattes:
+            print("no overlay was trained: there is nothing to compare")
+            return
+        shown = replace(region, outside=region.outside & ~hidden_by(mattes, region.outside.shape))
+        print(f"hidden outside the mask {1 - float(shown.outside.sum() / region.outside.sum()):.1%}")
+        off, without = self._train(region, "overlay=off")
+        print("| outside the mask, dB | off | with an overlay |", "|---|---|---|", sep="\n")
+        print(f"| everywhere | {outside(off.views)} | {outside(outcome.views)} |")
+        if shown.outside.any():
+            both = [outside(evaluate(each, FlipProcesses(1), shown)) for each in (without, pipeline)]
+            print(f"| where the overlay hides less than half | {' | '.join(both)} |")
 
     def _train(self, region: ArtifactRegion, *settings: str) -> tuple[Outcome, SSAPipeline]:
         from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings

@@ -170,6 +170,7 @@ REFUSED = [
     ("simulator_speed --data x --effects mud foo", "effects has no 'foo'"),
     ("viewer_frame_time --data x --height 0", "--height must be at least 1, got 0"),
     ("real_artifact --data x --steps 0", "--steps must be at least 1, got 0"),
+    ("real_artifact --data x --beside-off --settings overlay=off", "--settings state overlay=off"),
 ]
 
 
