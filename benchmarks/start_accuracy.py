@@ -24,8 +24,10 @@ from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.detection import detect
+from ssa_nerfstudio.evidence.detection import Detection, detect
+from ssa_nerfstudio.evidence.distant_points import distant_points
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
+from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
@@ -64,6 +66,10 @@ ESTIMATE = {
     "guided_upsampling": ("RADIUS",),
 }
 """Those of the modules that estimate the layers."""
+DISTANT = {
+    "distant_points": ("SPACING", "DISTANCE", "MIN_DIRECTIONS", "MIN_SIGHTS", "MIN_SHOWN"),
+}
+"""Those of the module that finds distant seeds, behind the layers that were estimated."""
 
 
 @dataclass
@@ -73,7 +79,7 @@ class Command:
     data: list[Path] = field(default_factory=list)
     """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
-    """Also halve and double each constant."""
+    """Also halve and double each constant, of distant seeds, too, of which their number is told."""
     output: Annotated[Path, file_to_write()] | None = None
     """File to which every result is added, as a line of JSON. What it has is not measured again."""
 
@@ -91,7 +97,7 @@ class Command:
         keys = "data", "constant", "factor"
         lines = [] if self.output is None else read_lines(self.output, keys, since="verdict")
         known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
-        groups = [*DETECTION.items(), *ESTIMATE.items()] if self.vary else []
+        groups = [*DETECTION.items(), *ESTIMATE.items(), *DISTANT.items()] if self.vary else []
         constants = [f"{module}.{name}" for module, names in groups for name in names]
         variants = [("", 1.0), *((name, factor) for name in constants for factor in (0.5, 2.0))]
         for path in self.data:
@@ -103,7 +109,10 @@ class Command:
                     with self.output.open("a", encoding="utf-8") as file:
                         file.write(json.dumps(result) + "\n")
         if self.vary:
-            _print_sensitivity(known, [path.name for path in self.data], constants)
+            names = [path.name for path in self.data]
+            of_seeds = [constant for constant in constants if constant.split(".")[0] in DISTANT]
+            _print_sensitivity(known, names, [constant for constant in constants if constant not in of_seeds])
+            _print_seeds(known, names, of_seeds)
 
 
 def _check(path: Path) -> None:
@@ -142,14 +151,26 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             parts = layers["T"].mean(axis=-1, keepdims=True), layers["B"]
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
+
+    def start(changed: bool) -> tuple[Detection, LayerEstimate, tuple[torch.Tensor, torch.Tensor]]:
+        detection = detect(statistics) if changed else plain
+        found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
+        overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
+        initialize_from(overlay, found, guide, detection.mask)
+        return detection, found, overlay.layers()
+
+    own = None
     for constant, factor in variants:
-        started = time.monotonic()
-        with _scaled(constant, factor):
-            detection = detect(statistics) if constant.split(".")[0] in DETECTION else plain
-            found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
-            overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
-            initialize_from(overlay, found, guide, detection.mask)
-        error = torch.cat(overlay.layers(), dim=-1).detach() - truth
+        started, module, seeds = time.monotonic(), constant.split(".")[0], {}
+        if module in DISTANT or not constant:
+            detection, found, layers = own = own or start(False)
+            with _scaled(constant, factor):
+                shown, hidden = distant_points(points, views, [layers] * len(views), [0] * len(views))
+            seeds = {"seeds": len(shown), "backdrop": len(hidden)}
+        else:
+            with _scaled(constant, factor):
+                detection, found, layers = start(module in DETECTION)
+        error = torch.cat(layers, dim=-1).detach() - truth
         size = error.abs()
         yield {
             "data": path.name,
@@ -164,6 +185,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "verdict": detection.verdict,
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),
+            **seeds,
         }
 
 
@@ -223,6 +245,19 @@ def _print_sensitivity(
     print(f"| all as they are | {errors('', 1.0)} | {errors('', 1.0)} |")
     for constant in constants:
         print(f"| {constant} | {errors(constant, 0.5)} | {errors(constant, 2.0)} |")
+
+
+def _print_seeds(known: dict[tuple[str, str, float], dict[str, Any]], names: list[str], constants: list[str]) -> None:
+    """A row for each constant at half and at twice its value: the number of distant seeds of each dataset."""
+
+    def counts(constant: str, factor: float) -> str:
+        return " | ".join(str(known[name, constant, factor].get("seeds", "")) for name in names)
+
+    columns = " | ".join(names)
+    print(f"\n| distant seeds | half: {columns} | twice: {columns} |\n|{'---|' * (1 + 2 * len(names))}")
+    for constant in ("", *constants):
+        print(f"| {constant or 'all as they are'} | {counts(constant, 0.5 if constant else 1.0)} | ", end="")
+        print(f"{counts(constant, 2.0 if constant else 1.0)} |")
 
 
 if __name__ == "__main__":
