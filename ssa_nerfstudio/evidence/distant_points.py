@@ -36,8 +36,11 @@ MAX_DIRECTIONS = 2**18
 """Of the whole sphere; a telephoto lens, whose pixels are smaller, has a larger spacing."""
 DISTANCE = 3.0
 """Of the distant points, relative to that of the 99th percentile of the scene's points, from the cameras' mean."""
-NEARER = (0.5, 0.9, 0.99)
+NEARER = (0.1, 0.5, 0.9, 0.99)
 """Quantiles of the scene's points whose distances are the alternatives: there are the scene's surfaces."""
+NOISE = 0.05
+"""Difference of colors, mean over channels, that costs half of what an outlier does: leaves that a sky is seen through
+say nothing about it."""
 MIN_DIRECTIONS = 30
 """Of an area that can be compared with nearer distances; see `_distant`. On five captures patches that are far away by
 chance have at most 21, skies at least 39."""
@@ -86,7 +89,8 @@ def distant_points(
     A direction is a candidate if half of the views that show it see none of the scene's points around it, and if one
     color for it explains these photos at least as well as one color for each of their pixels does: what stands still in
     the frame is an artifact. A connected area of candidates is far away if that explains its photos better than any
-    distance does at which the scene has its points: what is nearer has parallax. Where cameras are too close together
+    distance does at which the scene has its points: what is nearer has parallax. Costs are robust, because something
+    nearer may hide a direction from some of the views. Where cameras are too close together
     to have any, nothing speaks against it. A direction that fewer than MIN_SIGHTS of the views show, because of an
     artifact or a mask, continues what is seen nearest to it.
 
@@ -164,7 +168,7 @@ class _Explanation:
     median: Tensor
     """[N, 3]: their colors."""
     residual: Tensor
-    """[N]: mean absolute difference of the photos from it."""
+    """[N] in [0, 1): mean cost of the photos' differences d from it, d / (d + NOISE)."""
     still: Tensor
     """[N]: that from one color for each pixel, the photos' mean."""
     sights: Tensor
@@ -287,6 +291,7 @@ def _explanation(positions: Tensor, frames: Sequence[tuple[View, _Scene, Tensor,
     middle = sights.cumsum(0) - sights + sights // 2
     median = color.new_zeros(count, 3)
     median[sights > 0] = color[middle[sights > 0]]
-    residuals = torch.stack([(color - other).abs().sum(dim=-1) for other in (median[index], still)], dim=-1)
+    residuals = torch.stack([(color - other).abs().mean(dim=-1) for other in (median[index], still)], dim=-1)
+    residuals = residuals / (residuals + NOISE)
     residual, still = (summed(index, residuals, count) / sights.clamp_min(1)[:, None]).unbind(dim=-1)
     return _Explanation(median, residual, still, sights, shown, in_frame)

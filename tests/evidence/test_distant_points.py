@@ -170,6 +170,26 @@ def test_far_hills_do_not_hide_a_sky() -> None:
     assert len(distant_points(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200
 
 
+def test_leaves_that_hide_a_sky_from_some_views_leave_none_of_it_out() -> None:
+    """At 6 units from the cameras, without points; some 30 % of the sky are behind them in each view."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    rays = torch.stack([x, y, torch.ones_like(x)], dim=-1) @ torch.linalg.inv(K).T
+    views, hidden = [], []
+    for view in turning_views():
+        turn = view.world_to_camera[:3, :3]
+        camera, direction = -(turn.T @ view.world_to_camera[:3, 3]), rays @ turn
+        across, up, _ = (camera + direction * ((6 - camera[2]) / direction[..., 2:])).unbind(dim=-1)
+        chance = ((127.1 * (10 * across).floor() + 311.7 * (10 * up).floor()).sin() * 43758.5) % 1
+        leaf = (chance < 0.3) & (up < 0)
+        hidden.append(leaf.float().mean())
+        photo = torch.where(leaf[..., None], torch.tensor([0.1, 0.2, 0.05]), view.image)
+        views.append(View(photo, None, view.world_to_camera, K))
+    assert 0.1 < torch.stack(hidden).mean() < 0.2, "the sky is half of the frame"
+    found, _ = distant_points(GROUND, views, SIGHT, ONE)
+    assert len(found) > 0.98 * len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    assert errors(found).median() < 0.03
+
+
 @pytest.mark.parametrize(("side", "found"), [(24, True), (16, False)])
 def test_a_gap_between_points_is_no_sky_unless_it_is_wide(side: int, found: bool) -> None:
     """Splats grow into a small one from beside it."""
