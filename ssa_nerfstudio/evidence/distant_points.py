@@ -36,7 +36,7 @@ MAX_DIRECTIONS = 2**18
 """Of the whole sphere; a telephoto lens, whose pixels are smaller, has a larger spacing."""
 DISTANCE = 3.0
 """Of the distant points, relative to that of the 99th percentile of the scene's points, from the cameras' mean."""
-NEARER = (0.1, 0.5, 0.9, 0.99)
+NEARER = (0.5, 0.9, 0.99)
 """Quantiles of the scene's points whose distances are the alternatives: there are the scene's surfaces."""
 NOISE = 0.05
 """Difference of colors, mean over channels, that costs half of what an outlier does: leaves that a sky is seen through
