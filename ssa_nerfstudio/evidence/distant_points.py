@@ -42,8 +42,7 @@ NOISE = 0.05
 """Difference of colors, mean over channels, that costs half of what an outlier does: leaves that a sky is seen through
 say nothing about it."""
 MIN_DIRECTIONS = 30
-"""Of an area that can be compared with nearer distances; see `_distant`. On five captures patches that are far away by
-chance have at most 21, skies at least 39."""
+"""Of an area that can be compared with nearer distances; among fewer one distance is the best by chance."""
 MIN_SIGHTS = 3
 """Views that must see a direction: the fewest of which a median leaves one out."""
 MAX_VIEWS = 128
@@ -72,8 +71,8 @@ class DistantPoints:
 
     @classmethod
     def of_table(cls, table: Tensor) -> DistantPoints:
-        """The points of a `table`; of an empty one the spacing is 1."""
-        return cls(table[:, :3], table[:, 3:6], float(table[0, 6]) if len(table) else 1.0)
+        """The points of a `table` of at least one."""
+        return cls(table[:, :3], table[:, 3:6], float(table[0, 6]))
 
 
 @torch.no_grad()
@@ -89,10 +88,10 @@ def distant_points(
     A direction is a candidate if half of the views that show it see none of the scene's points around it, and if one
     color for it explains these photos at least as well as one color for each of their pixels does: what stands still in
     the frame is an artifact. A connected area of candidates is far away if that explains its photos better than any
-    distance does at which the scene has its points: what is nearer has parallax. Costs are robust, because something
-    nearer may hide a direction from some of the views. Where cameras are too close together
-    to have any, nothing speaks against it. A direction that fewer than MIN_SIGHTS of the views show, because of an
-    artifact or a mask, continues what is seen nearest to it.
+    distance does at which the scene has its points: what is nearer has parallax. Where cameras are too close together
+    to have any, nothing speaks against it. Costs are robust, because something nearer may hide a direction from some of
+    the views. A direction that fewer than MIN_SIGHTS of the views show, because of an artifact or a mask, continues
+    what is seen nearest to it.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.

@@ -83,6 +83,8 @@ def add_distant(
         optimizers: of the parameters, by their names, so that a checkpoint can be resumed; None before they are built.
     """
     count = len(points)
+    if not count:
+        return
     new = {name: values.data.new_zeros(count, *values.shape[1:]) for name, values in params.items()}
     new["means"].copy_(points.positions)
     new["scales"].fill_(math.log(points.spacing))
@@ -90,8 +92,6 @@ def add_distant(
     new["features_dc"].copy_(color_parameters(points.colors, sh_degree))
     logit = params["opacities"].data[:1] if opacity is None else torch.tensor(opacity).logit()
     new["opacities"].copy_(logit.expand(count, 1))
-    if not count:
-        return
     if optimizers is None:
         for name, values in params.items():
             params[name] = Parameter(torch.cat([values.data, new[name]]))
