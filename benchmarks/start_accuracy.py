@@ -67,7 +67,7 @@ ESTIMATE = {
 }
 """Those of the modules that estimate the layers."""
 DISTANT = {
-    "distant_points": ("SPACING", "DISTANCE", "NOISE", "MIN_DIRECTIONS", "MIN_SIGHTS", "MIN_SHOWN"),
+    "distant_points": ("SPACING", "DISTANCE", "NOISE", "PATCH", "SIGNIFICANCE", "MIN_SIGHTS", "MIN_SHOWN"),
 }
 """Those of the module that finds distant seeds, behind the layers that were estimated."""
 

@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import torch
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
+from scipy.special import stdtrit
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
@@ -41,14 +43,21 @@ NEARER = (0.5, 0.9, 0.99)
 NOISE = 0.05
 """Difference of colors, mean over channels, that costs half of what an outlier does: leaves that a sky is seen through
 say nothing about it."""
-MIN_DIRECTIONS = 30
-"""Of an area that can be compared with nearer distances; among fewer one distance is the best by chance."""
+PATCH = 30
+"""Directions that are left out together, because one alone says little."""
+SIGNIFICANCE = 0.001
+"""Probability that chance alone leaves a patch out, or takes an area for distant."""
+NEIGHBORHOOD = 1.5
+"""Distance up to which directions are connected, relative to their spacing."""
 MIN_SIGHTS = 3
 """Views that must see a direction: the fewest of which a median leaves one out."""
 MAX_VIEWS = 128
-"""Views that are read; of more a regular subset."""
+"""Views that are read; of more a regular subset of each group."""
 MIN_SHOWN = 0.5
 """Transmittance of the artifact below which a pixel does not count."""
+
+
+_Place = TypeVar("_Place", int, Tensor)
 
 
 @dataclass(frozen=True)
@@ -85,13 +94,14 @@ def distant_points(
 ) -> tuple[DistantPoints, DistantPoints]:
     """Find directions in which the photos show something far away, and no point is seen.
 
-    A direction is a candidate if half of the views that show it see none of the scene's points around it, and if one
-    color for it explains these photos at least as well as one color for each of their pixels does: what stands still in
-    the frame is an artifact. A connected area of candidates is far away if that explains its photos better than any
-    distance does at which the scene has its points: what is nearer has parallax. Where cameras are too close together
-    to have any, nothing speaks against it. Costs are robust, because something nearer may hide a direction from some of
-    the views. A direction that fewer than MIN_SIGHTS of the views show, because of an artifact or a mask, continues
-    what is seen nearest to it.
+    A direction is a candidate if half of the views that show it see none of the scene's points around it. If it is far
+    away, two views agree on its color. Alternatives are that they agree at a pixel, because an artifact stands still in
+    the frame, or at a distance at which the scene has its points, because what is nearer has parallax. Costs are
+    compared view by view: patches that an alternative explains better, by a one-sided t-test over the views, are left
+    out, and a connected area of the others is far away if that explains it better than each of the nearer distances, by
+    the same test, and it does not stand still. Where cameras are too close together for any parallax, nothing speaks
+    against it. Costs are robust, because something nearer may hide a direction from some of the views. A direction that
+    fewer than MIN_SIGHTS of the views show, because of an artifact or a mask, continues what is seen nearest to it.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
@@ -104,8 +114,8 @@ def distant_points(
     Returns:
         The points that photos show, and those that they hide, on the device of the scene's; there may be none.
     """
-    every = -(-len(views) // MAX_VIEWS)
-    kept = [view for group in sorted({*groups}) for view in _members(groups, group)[::every]]
+    by_group = sorted(range(len(views)), key=lambda view: groups[view])
+    kept = by_group[:: -(-len(views) // MAX_VIEWS)]
     views, layers = [views[view] for view in kept], [layers[view] for view in kept]
     groups = [groups[view] for view in kept]
     points = regular_subset(points, len(views))
@@ -125,18 +135,19 @@ def distant_points(
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
     taken = [_near_points(points, view, scene) for view, scene in zip(views, scenes, strict=True)]
     frames = list(zip(views, scenes, taken, _still_pictures(scenes, groups), strict=True))
-    far = _explanation(center + radius * directions, frames)
+    far = _sights(center + radius * directions, frames)
     shown = far.shown >= MIN_SIGHTS
-    likely = shown & (far.sights >= MIN_SIGHTS) & (2 * far.sights >= far.shown) & (far.residual <= far.still)
+    likely = shown & (far.counted >= MIN_SIGHTS) & (2 * far.counted >= far.shown)
     candidates = likely.nonzero()[:, 0]
     if not len(candidates):
         nothing = DistantPoints(directions[:0], directions[:0], radius * angle)
         return nothing, nothing
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
-    alternatives = [_explanation(center + at * directions[candidates], frames) for at in nearer]
-    areas = _connected(directions[candidates], 1.5 * angle)
+    cost, still = far.cost[candidates], far.still[candidates]
+    alternatives = [_sights(center + at * directions[candidates], frames).cost for at in nearer]
+    distant = _distant(directions[candidates], angle, cost - still, [cost - other for other in alternatives])
     found = torch.zeros_like(shown)
-    found[candidates[_distant(areas, far.residual[candidates], alternatives)]] = True
+    found[candidates[distant]] = True
     behind = ((far.in_frame >= MIN_SIGHTS) & ~shown).nonzero()[:, 0]
     seen = shown.nonzero()[:, 0]
     _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[behind].cpu().numpy())
@@ -161,45 +172,77 @@ class _Scene:
 
 
 @dataclass(frozen=True)
-class _Explanation:
-    """How well points of one color each explain the photos."""
+class _Sights:
+    """What V views show of N positions, and how well another view explains it: a difference d costs d / (d + NOISE).
+
+    Of n views the other one is n / 3 further, so that each is compared with two. The median of all would be less noisy
+    the more there are, and of two distances the one that is in more frames would seem better.
+    Costs are NaN where a position does not count: not in the frame, hidden, or near one of the scene's points.
+    """
 
     median: Tensor
-    """[N, 3]: their colors."""
-    residual: Tensor
-    """[N] in [0, 1): mean cost of the photos' differences d from it, d / (d + NOISE)."""
+    """Of the colors that count, the one of median brightness, [N, 3]."""
+    cost: Tensor
+    """[N, V], of the color there in another view; NaN for all views if fewer than MIN_SIGHTS count."""
     still: Tensor
-    """[N]: that from one color for each pixel, the photos' mean."""
-    sights: Tensor
-    """[N] int64: views that show a point, and none of the scene's points near it: those that count."""
+    """[N, V], of another view's color at the same pixel; NaN also where that shows nothing."""
+    counted: Tensor
+    """[N] int64: views that count."""
     shown: Tensor
-    """[N] int64: views that show a point."""
+    """[N] int64: views that show a position, near points or not."""
     in_frame: Tensor
-    """[N] int64: views with a point in the frame."""
+    """[N] int64: views with a position in the frame."""
 
 
-def _distant(area: Tensor, far: Tensor, alternatives: Sequence[_Explanation]) -> Tensor:
-    """Whether directions are of a connected area that is explained better far away than at any alternative, bool [N].
-
-    Only directions that MIN_SIGHTS views see at every alternative count. Among few directions one distance is the best
-    by chance, as on a plain wall; and a small area needs no points, because splats grow into it from beside it.
+def _distant(directions: Tensor, angle: float, beside_still: Tensor, beside_nearer: Sequence[Tensor]) -> Tensor:
+    """Whether directions belong to an area that is far away, bool [N].
 
     Args:
-        area: number of each direction's area [N].
-        far: their residuals far away, [N].
-        alternatives: the directions nearer by; none where nothing has parallax.
+        directions: [N, 3].
+        angle: between neighbors, radians.
+        beside_still: cost of each direction far away in each view, less that where it stands still in the frame [N, V];
+            NaN where they cannot be compared.
+        beside_nearer: less that at each of the nearer distances, likewise.
     """
-    comparable = torch.ones_like(area, dtype=torch.bool)
-    for other in alternatives:
-        comparable &= other.sights >= MIN_SIGHTS
-    values = torch.stack([torch.ones_like(far), far, *(other.residual for other in alternatives)], dim=-1)
-    totals = summed(area, torch.where(comparable[:, None], values, 0), int(area.max()) + 1)
-    size, far_away, nearer = totals.split((1, 1, len(alternatives)), dim=1)
-    return ((size[:, 0] >= MIN_DIRECTIONS) & (far_away < nearer).all(dim=1))[area]
+    differences = beside_still, *beside_nearer
+    patches = _directions(round(4 * math.pi / (PATCH * angle**2)))
+    _, patch = KDTree(patches.numpy()).query(directions.cpu().numpy())
+    patch = torch.from_numpy(np.asarray(patch, dtype=np.int64)).to(directions.device)
+    excluded = torch.zeros_like(directions[:, 0], dtype=torch.bool)
+    for difference in differences:
+        excluded |= (_significance(patch, difference, len(patches)) > 1)[patch]
+    rest = (~excluded).nonzero()[:, 0]
+    area = _connected(directions[rest], NEIGHBORHOOD * angle)
+    still, *nearer = (_significance(area, difference[rest], len(rest)) for difference in differences)
+    accepted = still <= 1
+    for value in nearer:
+        accepted &= value < -1
+    distant = torch.zeros_like(excluded)
+    distant[rest] = accepted[area]
+    return distant
 
 
-def _members(groups: Sequence[int], group: int) -> list[int]:
-    return [view for view, of in enumerate(groups) if of == group]
+def _significance(part: Tensor, differences: Tensor, count: int) -> Tensor:
+    """Mean difference of each part, relative to what chance exceeds with a probability of SIGNIFICANCE, [count].
+
+    The unit of the t-test is a view, because what one view shows is not independent. 0 where fewer than MIN_SIGHTS
+    views can be compared.
+
+    Args:
+        part: number of the part that a direction belongs to, [N].
+        differences: of each direction in each view [N, V]; NaN where there is none.
+        count: of the parts.
+    """
+    totals = summed(part, differences.nan_to_num(), count)
+    counts = summed(part, differences.isfinite().to(differences), count)
+    views = (counts > 0).sum(dim=1)
+    sums = totals.sum(dim=1)
+    means = sums / counts.sum(dim=1).clamp_min(1)
+    spread = (totals - counts * means[:, None]).square().sum(dim=1)
+    error = (spread * views / (views - 1).clamp_min(1)).sqrt()
+    quantiles = stdtrit(np.arange(1, max(counts.shape[1], 2)), 1 - SIGNIFICANCE)
+    least = error * torch.from_numpy(quantiles).to(error)[(views - 2).clamp_min(0)]
+    return torch.where(views >= MIN_SIGHTS, sums / least.clamp_min(torch.finfo(least.dtype).tiny), 0)
 
 
 def _directions(count: int) -> Tensor:
@@ -212,6 +255,8 @@ def _directions(count: int) -> Tensor:
 
 def _connected(directions: Tensor, angle: float) -> Tensor:
     """Number of the connected area of each direction [N], of neighbors within an angle (radians)."""
+    if not len(directions):
+        return torch.zeros(0, dtype=torch.int64, device=directions.device)
     pairs = KDTree(directions.cpu().numpy()).query_pairs(angle, output_type="ndarray")
     linked = coo_array((np.ones(len(pairs), bool), (pairs[:, 0], pairs[:, 1])), shape=2 * (len(directions),))
     return torch.from_numpy(connected_components(linked, directed=False)[1].astype(np.int64)).to(directions.device)
@@ -241,14 +286,22 @@ def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, artifact_is_expo
 
 
 def _still_pictures(scenes: Sequence[_Scene], groups: Sequence[int]) -> list[Tensor]:
-    """For each scene the mean over those of its group and size, [h w, 3]."""
-    keys = [(group, scene.shown.shape) for scene, group in zip(scenes, groups, strict=True)]
-    totals: dict[tuple[int, torch.Size], Tensor] = {}
-    for key, scene in zip(keys, scenes, strict=True):
-        total = torch.cat([scene.color * scene.shown, scene.shown.to(scene.color)], dim=-1).reshape(-1, 4)
-        totals[key] = totals[key] + total if key in totals else total
-    means = {key: total[:, :3] / total[:, 3:].clamp_min(1) for key, total in totals.items()}
-    return [means[key] for key in keys]
+    """For each scene another of its group and size, a third of them further, [h w, 3]; NaN where that shows nothing."""
+    alike: dict[tuple[int, torch.Size], list[int]] = {}
+    for number, (scene, group) in enumerate(zip(scenes, groups, strict=True)):
+        alike.setdefault((group, scene.shown.shape), []).append(number)
+    pictures = [torch.where(scene.shown, scene.color, torch.nan).reshape(-1, 3) for scene in scenes]
+    others = [torch.full_like(picture, torch.nan) for picture in pictures]
+    for members in alike.values():
+        if len(members) >= MIN_SIGHTS:
+            for place, number in enumerate(members):
+                others[number] = pictures[members[_another(place, len(members))]]
+    return others
+
+
+def _another(place: _Place, count: _Place) -> _Place:
+    """Which of at least three a view is compared with, given the place of its own; each is with two different ones."""
+    return (place + count // 3) % count
 
 
 def _pixels(positions: Tensor, view: View, scene: _Scene) -> tuple[Tensor, Tensor]:
@@ -268,29 +321,33 @@ def _near_points(points: Tensor, view: View, scene: _Scene) -> Tensor:
     return nn.functional.max_pool2d(taken.reshape(1, height, width), side, 1, OCCLUSION_RADIUS).flatten() > 0
 
 
-def _explanation(positions: Tensor, frames: Sequence[tuple[View, _Scene, Tensor, Tensor]]) -> _Explanation:
-    """How well one color for each of the positions [N, 3] explains the photos.
+def _sights(positions: Tensor, frames: Sequence[tuple[View, _Scene, Tensor, Tensor]]) -> _Sights:
+    """What the photos show of positions [N, 3].
 
     Args:
         positions: world units.
         frames: of each view what it shows, what is `_near_points`, and its picture of `_still_pictures`.
     """
     count, sights = len(positions), []
-    for view, scene, near, picture in frames:
+    for number, (view, scene, near, picture) in enumerate(frames):
         index, pixel = _pixels(positions, view, scene)
         color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (scene.color, picture))
         shown = scene.shown.flatten().to(positions.device)[pixel]
-        sights.append((index, color, still, shown, shown & ~near[pixel]))
-    index, color, still, shown, free = (torch.cat(each) for each in zip(*sights, strict=True))
+        sights.append((index, torch.full_like(index, number), color, still, shown, shown & ~near[pixel]))
+    index, view, color, still, shown, counts = (torch.cat(each) for each in zip(*sights, strict=True))
     in_frame, shown = torch.bincount(index, minlength=count), torch.bincount(index[shown], minlength=count)
-    index, color, still = index[free], color[free], still[free]
-    order = order_by_point(index, color)
-    index, color, still = index[order], color[order], still[order]
-    sights = torch.bincount(index, minlength=count)
-    middle = sights.cumsum(0) - sights + sights // 2
+    counts = counts.nonzero()[:, 0]
+    in_views = counts[torch.argsort(index[counts], stable=True)]
+    index, view, color, still = index[in_views], view[in_views], color[in_views], still[in_views]
+    counted = torch.bincount(index, minlength=count)
+    first = counted.cumsum(0) - counted
     median = color.new_zeros(count, 3)
-    median[sights > 0] = color[middle[sights > 0]]
-    residuals = torch.stack([(color - other).abs().mean(dim=-1) for other in (median[index], still)], dim=-1)
-    residuals = residuals / (residuals + NOISE)
-    residual, still = (summed(index, residuals, count) / sights.clamp_min(1)[:, None]).unbind(dim=-1)
-    return _Explanation(median, residual, still, sights, shown, in_frame)
+    median[counted > 0] = color[order_by_point(index, color)][(first + counted // 2)[counted > 0]]
+    place = torch.arange(len(index), device=index.device) - first[index]
+    other = first[index] + _another(place, counted[index])
+    costs = color.new_full((2, count, len(frames)), torch.nan)
+    for cost, reference in zip(costs, (color[other], still), strict=True):
+        difference = (color - reference).abs().mean(dim=-1)
+        cost[index, view] = difference / (difference + NOISE)
+    costs[0, counted < MIN_SIGHTS] = torch.nan
+    return _Sights(median, costs[0], costs[1], counted, shown, in_frame)

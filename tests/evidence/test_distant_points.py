@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import pytest
 import torch
@@ -10,10 +11,12 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence import distant_points as distant_points_module
 from ssa_nerfstudio.evidence.distant_points import (
-    MIN_DIRECTIONS,
+    MAX_VIEWS,
+    SIGNIFICANCE,
     DistantPoints,
+    _directions,
     _distant,
-    _Explanation,
+    _significance,
     distant_points,
 )
 from ssa_nerfstudio.evidence.point_samples import View
@@ -34,7 +37,7 @@ def sky(direction: Tensor) -> Tensor:
     return torch.stack([0.5 + 0.4 * (12 * turn).sin(), 0.5 + 0.3 * (9 * turn).cos(), 0.4 + 0 * turn], dim=-1)
 
 
-def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = False) -> list[View]:
+def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = False, step: float = 0.1) -> list[View]:
     """Seven cameras that go forward and turn by 12 degrees; a still picture stands in the frame instead of the sky."""
     x, y = torch.arange(WIDTH) + 0.5, torch.arange(HEIGHT) + 0.5
     rays = torch.stack([*torch.meshgrid(y, x, indexing="ij"), torch.ones(HEIGHT, WIDTH)], dim=-1)[..., [1, 0, 2]]
@@ -47,7 +50,7 @@ def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = F
             dtype=torch.float32,
         )
         pose = torch.eye(4)
-        pose[:3, :3], pose[2, 3] = turn, -0.1 * number
+        pose[:3, :3], pose[2, 3] = turn, -step * number
         photo = sky(rays if still else rays @ turn)
         if artifact is not None:
             photo = artifact[0] * photo + artifact[1]
@@ -190,46 +193,105 @@ def test_leaves_that_hide_a_sky_from_some_views_leave_none_of_it_out() -> None:
     assert errors(found).median() < 0.03
 
 
-@pytest.mark.parametrize(("side", "found"), [(24, True), (16, False)])
-def test_a_gap_between_points_is_no_sky_unless_it_is_wide(side: int, found: bool) -> None:
-    """Splats grow into a small one from beside it."""
-    across, up = torch.meshgrid(torch.arange(-90, 90) / 140, torch.arange(-60, 4) / 140, indexing="ij")
-    hole = (across.abs() < side / 140) & ((up + 0.2).abs() < side / 140)
-    leaves = 20 * torch.stack([across, up, torch.ones_like(up)], dim=-1)[~hole]
-    seeds, _ = distant_points(torch.cat([GROUND[::5], leaves]), turning_views(), SIGHT, ONE)
-    assert (len(seeds) >= MIN_DIRECTIONS) == found
-    assert found or not len(seeds)
+def noisy(view: View, generator: torch.Generator, amount: float = 0.01) -> View:
+    """A view with noise of its sensor."""
+    image = view.image + amount * torch.randn(view.image.shape, generator=generator)
+    return View(image.clamp(0, 1), None, view.world_to_camera, K)
 
 
-def explanation(residual: Tensor, sights: Tensor | int = 9) -> _Explanation:
-    """Of directions with these residuals [N], seen by so many views."""
-    seen = torch.as_tensor(sights).expand(len(residual))
-    return _Explanation(torch.zeros(len(residual), 3), residual, residual, seen, seen, seen)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("noise", [0.01, 1.0])
+def test_noise_alone_is_not_far_away(noise: float, seed: int) -> None:
+    """A plain wall, and photos of which no two agree: every distance explains them as well, in however many frames."""
+    generator = torch.Generator().manual_seed(seed)
+    plain = [View(torch.full_like(v.image, 0.6), None, v.world_to_camera, K) for v in turning_views(step=0.5)]
+    views = [noisy(view, generator, noise) for view in plain]
+    assert not len(distant_points(GROUND, views, SIGHT, ONE)[0])
 
 
-def test_an_area_is_compared_where_enough_views_see_all_alternatives() -> None:
-    """Four areas of 40 directions: far away, nearer by, and two of which too few can be compared with the second."""
-    area = torch.arange(4).repeat_interleave(40)
-    far = torch.tensor([0.1, 0.3, 0.1, 0.1])[area]
-    first = explanation(torch.full((160,), 0.2))
-    sights = torch.full((160,), 9)
-    sights[80 + MIN_DIRECTIONS - 1 : 120] = 2
-    sights[120:] = 0
-    # Where few views see it, a nearer distance explains them by chance.
-    second = explanation(torch.where(sights < 3, 0.0, 0.2), sights)
-    assert _distant(area, far, [first, second]).reshape(4, 40).all(dim=1).tolist() == [True, False, False, False]
-    assert _distant(area, far, [first]).reshape(4, 40).all(dim=1).tolist() == [True, False, True, True]
-    assert _distant(area, far, []).all(), "nothing speaks against it"
-    sights[80 : 80 + MIN_DIRECTIONS] = 9
-    second = explanation(torch.where(sights < 3, 0.0, 0.2), sights)
-    assert _distant(area, far, [first, second])[80:120].all(), "directions that cannot be compared say nothing"
+def test_a_smooth_sky_is_found_below_noise() -> None:
+    """Between neighboring directions its color changes by less than the noise."""
+    generator = torch.Generator().manual_seed(0)
+    views = []
+    for view in turning_views():
+        smooth = View(0.5 + 0.1 * (view.image - 0.5), None, view.world_to_camera, K)
+        views.append(noisy(smooth, generator))
+    found, _ = distant_points(GROUND, views, SIGHT, ONE)
+    assert len(found) > 200
+    assert (found.positions[:, 1] / found.positions.norm(dim=-1)).max() < 0.1
 
 
-def test_few_directions_of_a_long_lens_are_too_few_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its directions are farther apart than two pixels, and as few of them are far away by chance."""
+def test_small_groups_find_what_one_group_does() -> None:
+    """Three cameras of seven views each, and of one view each, which cannot stand still."""
+    views = [view for view in turning_views() for _ in range(3)]
+    one = len(distant_points(GROUND, views, [None] * 21, [0] * 21)[0])
+    assert one > 200
+    for groups in ([0, 1, 2] * 7, list(range(21))):
+        assert len(distant_points(GROUND, views, [None] * 21, groups)[0]) > 0.9 * one
+
+
+def test_no_more_views_are_read_than_the_most(monkeypatch: pytest.MonkeyPatch) -> None:
+    read, original = [], distant_points_module._scene_in
+
+    def counted(view: View, *arguments: Any) -> Any:
+        read.append(view)
+        return original(view, *arguments)
+
+    monkeypatch.setattr(distant_points_module, "_scene_in", counted)
+    views = turning_views() * 40
+    distant_points(GROUND[::50], views, [None] * 280, [number // 2 for number in range(280)])
+    assert MAX_VIEWS // 2 < len(read) <= MAX_VIEWS
+
+
+def area(center: tuple[float, float], angle: float, width: float) -> Tensor:
+    """Directions [N, 3] of a lattice with this spacing, within a width around one (radians to the right and down)."""
+    directions = _directions(round(4 * math.pi / angle**2)).float()
+    at = torch.atan2(directions[:, 0], directions[:, 2]), torch.asin(directions[:, 1])
+    return directions[((at[0] - center[0]).abs() < width) & ((at[1] - center[1]).abs() < width)]
+
+
+def test_what_is_nearer_in_a_distant_area_is_left_out() -> None:
+    """A sky, and a wall connected with it; elsewhere another wall, and a picture that stands still."""
+    angle, generator = 0.03, torch.Generator().manual_seed(0)
+    places = [(0.0, 0.0), (0.4, 0.0), (1.5, 0.0), (-1.5, 0.0)]
+    parts = [area(place, angle, 0.2) for place in places]
+    part = torch.cat([torch.full((len(each),), number) for number, each in enumerate(parts)])
+
+    def differences(means: list[float]) -> Tensor:
+        return torch.tensor(means)[part][:, None] + 0.1 * torch.randn(len(part), 9, generator=generator)
+
+    far_from_still = differences([-0.3, -0.3, -0.3, 0.3])
+    far_from_near = differences([-0.3, 0.3, 0.3, -0.3])
+    other = differences([-0.3, -0.01, -0.01, -0.3])
+    other[:, ::2] = math.nan
+    found = _distant(torch.cat(parts), angle, far_from_still, [far_from_near, other])
+    sky_share, wall_share = (float(found[part == number].float().mean()) for number in range(2))
+    assert sky_share > 0.8
+    assert wall_share < 0.25, "a patch lies on both"
+    assert not found[part > 1].any()
+    other[part == 0, 2:] = math.nan
+    assert not _distant(torch.cat(parts), angle, far_from_still, [far_from_near, other]).any(), "one view says nothing"
+    assert _distant(torch.cat(parts), angle, far_from_still, [])[part < 3].all(), "nothing speaks against it"
+    assert not len(_distant(torch.zeros(0, 3), angle, torch.zeros(0, 9), []))
+
+
+@pytest.mark.parametrize("views", [3, 4, 10, 60])
+def test_chance_is_as_significant_as_stated(views: int) -> None:
+    """Also where views have different numbers of differences."""
+    generator = torch.Generator().manual_seed(views)
+    parts, each = 20_000, 4
+    values = torch.randn(parts * each, views, generator=generator).double()
+    values[torch.rand(values.shape, generator=generator) < 0.2] = math.nan
+    values[::each] = torch.randn(parts, views, generator=generator).double()
+    part = torch.arange(parts).repeat_interleave(each)
+    value = _significance(part, values, parts)
+    for chance in ((value > 1).double().mean(), (value < -1).double().mean()):
+        assert 0.4 * SIGNIFICANCE < chance < 2.5 * SIGNIFICANCE
+    assert (_significance(part, values + 3, parts) > 1).double().mean() > (0.1 if views < 4 else 0.5)
+
+
+def test_a_long_lens_has_fewer_directions(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its pixels are smaller, and its directions are farther apart than two of them."""
     found = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
     monkeypatch.setattr(distant_points_module, "MAX_DIRECTIONS", 4000)
-    wider = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
-    assert MIN_DIRECTIONS < wider < 0.5 * found
-    monkeypatch.setattr(distant_points_module, "MAX_DIRECTIONS", 800)
-    assert not len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    assert 20 < len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0]) < 0.5 * found
