@@ -26,9 +26,11 @@ from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.distant_points import distant_points
+from ssa_nerfstudio.evidence.gap_points import gap_points
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
+from ssa_nerfstudio.evidence.scene_photos import scene_photos
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.result_lines import read_lines
@@ -66,10 +68,12 @@ ESTIMATE = {
     "guided_upsampling": ("RADIUS",),
 }
 """Those of the modules that estimate the layers."""
-DISTANT = {
-    "distant_points": ("SPACING", "DISTANCE", "NOISE", "PATCH", "SIGNIFICANCE", "MIN_SIGHTS", "MIN_SHOWN"),
+SEEDS = {
+    "distant_points": ("SPACING", "DISTANCE", "NOISE", "PATCH", "SIGNIFICANCE", "MIN_SIGHTS"),
+    "gap_points": ("SPACING", "NEIGHBORS", "MAX_VIEWS"),
+    "scene_photos": ("MIN_SHOWN",),
 }
-"""Those of the module that finds distant seeds, behind the layers that were estimated."""
+"""Those of the modules that find more seeds, behind the layers that were estimated."""
 
 
 @dataclass
@@ -79,7 +83,7 @@ class Command:
     data: list[Path] = field(default_factory=list)
     """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
-    """Also halve and double each constant, of distant seeds, too, of which their number is told."""
+    """Also halve and double each constant, of more seeds, too, of which their number is told."""
     output: Annotated[Path, file_to_write()] | None = None
     """File to which every result is added, as a line of JSON. What it has is not measured again."""
 
@@ -97,7 +101,7 @@ class Command:
         keys = "data", "constant", "factor"
         lines = [] if self.output is None else read_lines(self.output, keys, since="verdict")
         known = {(line["data"], line["constant"], line["factor"]): line for line in lines}
-        groups = [*DETECTION.items(), *ESTIMATE.items(), *DISTANT.items()] if self.vary else []
+        groups = [*DETECTION.items(), *ESTIMATE.items(), *SEEDS.items()] if self.vary else []
         constants = [f"{module}.{name}" for module, names in groups for name in names]
         variants = [("", 1.0), *((name, factor) for name in constants for factor in (0.5, 2.0))]
         for path in self.data:
@@ -110,7 +114,7 @@ class Command:
                         file.write(json.dumps(result) + "\n")
         if self.vary:
             names = [path.name for path in self.data]
-            of_seeds = [constant for constant in constants if constant.split(".")[0] in DISTANT]
+            of_seeds = [constant for constant in constants if constant.split(".")[0] in SEEDS]
             _print_sensitivity(known, names, [constant for constant in constants if constant not in of_seeds])
             _print_seeds(known, names, of_seeds)
 
@@ -162,11 +166,13 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     own = None
     for constant, factor in variants:
         started, module, seeds = time.monotonic(), constant.split(".")[0], {}
-        if module in DISTANT or not constant:
+        if module in SEEDS or not constant:
             detection, found, layers = own = own or start(False)
             with _scaled(constant, factor):
-                shown, hidden = distant_points(points, views, [layers] * len(views), [0] * len(views))
-            seeds = {"seeds": len(shown), "backdrop": len(hidden)}
+                photos = scene_photos(views, [layers] * len(views), [0] * len(views))
+                shown, hidden = distant_points(points, photos)
+                gaps = gap_points(torch.cat([points, shown.positions]), photos)
+            seeds = {"seeds": len(shown), "backdrop": len(hidden), "gaps": len(gaps)}
         else:
             with _scaled(constant, factor):
                 detection, found, layers = start(module in DETECTION)
@@ -248,13 +254,14 @@ def _print_sensitivity(
 
 
 def _print_seeds(known: dict[tuple[str, str, float], dict[str, Any]], names: list[str], constants: list[str]) -> None:
-    """A row for each constant at half and at twice its value: the number of distant seeds of each dataset."""
+    """A row for each constant at half and at twice its value: numbers of distant and gap seeds of each dataset."""
 
     def counts(constant: str, factor: float) -> str:
-        return " | ".join(str(known[name, constant, factor].get("seeds", "")) for name in names)
+        rows = (known[name, constant, factor] for name in names)
+        return " | ".join(f"{row['seeds']}, {row['gaps']}" if "gaps" in row else "" for row in rows)
 
     columns = " | ".join(names)
-    print(f"\n| distant seeds | half: {columns} | twice: {columns} |\n|{'---|' * (1 + 2 * len(names))}")
+    print(f"\n| distant and gap seeds | half: {columns} | twice: {columns} |\n|{'---|' * (1 + 2 * len(names))}")
     for constant in ("", *constants):
         print(f"| {constant or 'all as they are'} | {counts(constant, 0.5 if constant else 1.0)} | ", end="")
         print(f"{counts(constant, 2.0 if constant else 1.0)} |")

@@ -17,20 +17,16 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 from scipy.special import stdtrit
-from torch import Tensor, nn
+from torch import Tensor
 
-from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.point_samples import (
     OCCLUSION_RADIUS,
-    View,
     order_by_point,
-    project,
     regular_subset,
     summed,
-    working_pixels,
-    working_reduction,
 )
-from ssa_nerfstudio.evidence.statistics import FULL_SCALE
+from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, near_points, pixels_of
+from ssa_nerfstudio.evidence.seeds import Seeds
 
 SPACING = 2.0
 """Of neighboring directions, working pixels."""
@@ -51,47 +47,13 @@ NEIGHBORHOOD = 1.5
 """Distance up to which directions are connected, relative to their spacing."""
 MIN_SIGHTS = 3
 """Views that must see a direction: the fewest of which a median leaves one out."""
-MAX_VIEWS = 128
-"""Views that are read; of more a regular subset of each group."""
-MIN_SHOWN = 0.5
-"""Transmittance of the artifact below which a pixel does not count."""
 
 
 _Place = TypeVar("_Place", int, Tensor)
 
 
-@dataclass(frozen=True)
-class DistantPoints:
-    """Points on a sphere around the cameras."""
-
-    positions: Tensor
-    """[N, 3], world units."""
-    colors: Tensor
-    """[N, 3] in [0, 1]."""
-    spacing: float
-    """Distance of neighbors, world units."""
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    def table(self) -> Tensor:
-        """[N, 7], for a checkpoint: positions, colors and the spacing."""
-        return torch.cat([self.positions, self.colors, torch.full_like(self.positions[:, :1], self.spacing)], dim=-1)
-
-    @classmethod
-    def of_table(cls, table: Tensor) -> DistantPoints:
-        """The points of a `table` of at least one."""
-        return cls(table[:, :3], table[:, 3:6], float(table[0, 6]))
-
-
 @torch.no_grad()
-def distant_points(
-    points: Tensor,
-    views: Sequence[View],
-    layers: Sequence[tuple[Tensor, Tensor] | None],
-    groups: Sequence[int],
-    artifact_is_exposed: bool = False,
-) -> tuple[DistantPoints, DistantPoints]:
+def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> tuple[Seeds, Seeds]:
     """Find directions in which the photos show something far away, and no point is seen.
 
     A direction is a candidate if half of the views that show it see none of the scene's points around it. If it is far
@@ -105,43 +67,30 @@ def distant_points(
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
-        views: at least one.
-        layers: of each view's artifact, T [H, W, 1 or 3] and B [H, W, 3]; None where it has none. Views with the same
-            artifact have the same tuple.
-        groups: of each view: views of one group have the same camera and the same artifact.
-        artifact_is_exposed: views' gains act on scene and artifact together, and not on the scene alone.
+        photos: at least one.
 
     Returns:
-        The points that photos show, and those that they hide, on the device of the scene's; there may be none.
+        The seeds that photos show, and those that they hide, on the device of the scene's points; there may be none.
     """
-    by_group = sorted(range(len(views)), key=lambda view: groups[view])
-    kept = by_group[:: -(-len(views) // MAX_VIEWS)]
-    views, layers = [views[view] for view in kept], [layers[view] for view in kept]
-    groups = [groups[view] for view in kept]
-    points = regular_subset(points, len(views))
-    poses = torch.stack([view.world_to_camera for view in views])
+    points = regular_subset(points, len(photos))
+    poses = torch.stack([photo.view.world_to_camera for photo in photos])
     cameras = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].to(points)
     center = cameras.mean(dim=0)
     baseline = float((cameras - center).norm(dim=1).max())
     distances = (points - center).norm(dim=1)
     nearer = [float(distances.kthvalue(math.ceil(share * len(points))).values) for share in NEARER]
     radius = DISTANCE * nearer[-1]
-    of_views = {id(pair): _reduced_layers(pair, view) for pair, view in zip(layers, views, strict=True) if pair}
-    scenes = [
-        _scene_in(view, of_views.get(id(pair)), artifact_is_exposed) for view, pair in zip(views, layers, strict=True)
-    ]
-    angles = [scene.reduction / float(view.intrinsics[0, 0]) for scene, view in zip(scenes, views, strict=True)]
+    angles = [photo.reduction / float(photo.view.intrinsics[0, 0]) for photo in photos]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
-    taken = [_near_points(points, view, scene) for view, scene in zip(views, scenes, strict=True)]
-    frames = list(zip(views, scenes, taken, _still_pictures(scenes, groups), strict=True))
+    taken = [near_points(points, photo, OCCLUSION_RADIUS).flatten() for photo in photos]
+    frames = list(zip(photos, taken, _still_pictures(photos), strict=True))
     far = _sights(center + radius * directions, frames)
     shown = far.shown >= MIN_SIGHTS
     likely = shown & (far.counted >= MIN_SIGHTS) & (2 * far.counted >= far.shown)
     candidates = likely.nonzero()[:, 0]
     if not len(candidates):
-        nothing = DistantPoints(directions[:0], directions[:0], radius * angle)
-        return nothing, nothing
+        return Seeds.none(points), Seeds.none(points)
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
     cost, still = far.cost[candidates], far.still[candidates]
     alternatives = [_sights(center + at * directions[candidates], frames).cost for at in nearer]
@@ -153,22 +102,12 @@ def distant_points(
     _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[behind].cpu().numpy())
     source = seen[torch.from_numpy(np.asarray(nearest, dtype=np.int64)).to(seen)]
     behind, source = behind[found[source]], source[found[source]]
+    width = radius * angle
+    visible, hidden = center + radius * directions[found], center + radius * directions[behind]
     return (
-        DistantPoints(center + radius * directions[found], far.median[found], radius * angle),
-        DistantPoints(center + radius * directions[behind], far.median[source], radius * angle),
+        Seeds(visible, far.median[found], visible.new_full((len(visible),), width)),
+        Seeds(hidden, far.median[source], hidden.new_full((len(hidden),), width)),
     )
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """What a photo shows of the scene, at the working resolution."""
-
-    color: Tensor
-    """[h, w, 3]."""
-    shown: Tensor
-    """[h, w, 1] bool: no mask and no opaque artifact is there."""
-    reduction: int
-    """Photo pixels a working pixel."""
 
 
 @dataclass(frozen=True)
@@ -262,35 +201,12 @@ def _connected(directions: Tensor, angle: float) -> Tensor:
     return torch.from_numpy(connected_components(linked, directed=False)[1].astype(np.int64)).to(directions.device)
 
 
-def _reduced_layers(layers: tuple[Tensor, Tensor], view: View) -> tuple[Tensor, Tensor]:
-    """T [h, w, 1] and B [h, w, 3] at the working resolution, on the device of the photos."""
-    reduction = working_reduction(*view.image.shape[:2])
-    transmittance, addition = (reduced(layer, reduction).to(view.image.device) for layer in layers)
-    return transmittance.mean(dim=-1, keepdim=True), addition
-
-
-def _scene_in(view: View, layers: tuple[Tensor, Tensor] | None, artifact_is_exposed: bool) -> _Scene:
-    height, width = view.image.shape[:2]
-    reduction = working_reduction(height, width)
-    color = reduced(view.image[..., :3].float(), reduction) / FULL_SCALE.get(view.image.dtype, 1.0)
-    gain = torch.ones_like(color[0, 0]) if view.gain is None else view.gain.to(color)
-    shown = torch.ones_like(color[..., :1], dtype=torch.bool)
-    if view.mask is not None:
-        shown &= reduced((view.mask.reshape(height, width, 1) != 0).to(color), reduction) == 1
-    if layers is not None:
-        transmittance, addition = layers
-        shown &= transmittance >= MIN_SHOWN
-        color = color - (gain if artifact_is_exposed else 1.0) * addition
-        color = color / transmittance.clamp_min(MIN_SHOWN)
-    return _Scene((color / gain).clamp(0, 1), shown, reduction)
-
-
-def _still_pictures(scenes: Sequence[_Scene], groups: Sequence[int]) -> list[Tensor]:
-    """For each scene another of its group and size, a third of them further, [h w, 3]; NaN where that shows nothing."""
-    alike: dict[tuple[int, torch.Size], list[int]] = {}
-    for number, (scene, group) in enumerate(zip(scenes, groups, strict=True)):
-        alike.setdefault((group, scene.shown.shape), []).append(number)
-    pictures = [torch.where(scene.shown, scene.color, torch.nan).reshape(-1, 3) for scene in scenes]
+def _still_pictures(photos: Sequence[ScenePhoto]) -> list[Tensor]:
+    """For each photo another of its group and size, a third of them further, [h w, 3]; NaN where that shows nothing."""
+    alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
+    for number, photo in enumerate(photos):
+        alike.setdefault((photo.group, photo.size), []).append(number)
+    pictures = [torch.where(photo.shown, photo.color, torch.nan).reshape(-1, 3) for photo in photos]
     others = [torch.full_like(picture, torch.nan) for picture in pictures]
     for members in alike.values():
         if len(members) >= MIN_SIGHTS:
@@ -304,35 +220,18 @@ def _another(place: _Place, count: _Place) -> _Place:
     return (place + count // 3) % count
 
 
-def _pixels(positions: Tensor, view: View, scene: _Scene) -> tuple[Tensor, Tensor]:
-    """Indices [M] of the positions [N, 3] in the frame of a view, and their working pixels [M], row by row."""
-    height, width = scene.shown.shape[:2]
-    size = height * scene.reduction, width * scene.reduction
-    _, index, position, _ = project(positions, view.world_to_camera[None], view.intrinsics[None], *size)
-    return index, working_pixels(position, (height, width), scene.reduction)
-
-
-def _near_points(points: Tensor, view: View, scene: _Scene) -> Tensor:
-    """[h w] bool: one of the scene's points is in the working pixel or around it."""
-    height, width = scene.shown.shape[:2]
-    taken = torch.zeros(height * width, device=points.device)
-    taken[_pixels(points, view, scene)[1]] = 1
-    side = 2 * OCCLUSION_RADIUS + 1
-    return nn.functional.max_pool2d(taken.reshape(1, height, width), side, 1, OCCLUSION_RADIUS).flatten() > 0
-
-
-def _sights(positions: Tensor, frames: Sequence[tuple[View, _Scene, Tensor, Tensor]]) -> _Sights:
+def _sights(positions: Tensor, frames: Sequence[tuple[ScenePhoto, Tensor, Tensor]]) -> _Sights:
     """What the photos show of positions [N, 3].
 
     Args:
         positions: world units.
-        frames: of each view what it shows, what is `_near_points`, and its picture of `_still_pictures`.
+        frames: photos, where each is `near_points`, and its picture of `_still_pictures`.
     """
     count, sights = len(positions), []
-    for number, (view, scene, near, picture) in enumerate(frames):
-        index, pixel = _pixels(positions, view, scene)
-        color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (scene.color, picture))
-        shown = scene.shown.flatten().to(positions.device)[pixel]
+    for number, (photo, near, picture) in enumerate(frames):
+        index, pixel = pixels_of(positions, photo)
+        color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (photo.color, picture))
+        shown = photo.shown.flatten().to(positions.device)[pixel]
         sights.append((index, torch.full_like(index, number), color, still, shown, shown & ~near[pixel]))
     index, view, color, still, shown, counts = (torch.cat(each) for each in zip(*sights, strict=True))
     in_frame, shown = torch.bincount(index, minlength=count), torch.bincount(index[shown], minlength=count)

@@ -75,7 +75,7 @@ class PointSamples:
 
 
 @dataclass(frozen=True)
-class _Sights:
+class Sights:
     """M pairs of a view and a point that it sees, view by view."""
 
     view: Tensor
@@ -127,7 +127,7 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
         unknown = guide[..., 3:] == UNKNOWN_DEVIATION
         guide = _boxes(torch.cat([guide, unknown], dim=-1), reduction)
         of_pixels = guide[::reduction, ::reduction].reshape(-1, 5)
-    seen = _visible(points, views, reduction, size)
+    seen = visible(points, views, reduction, size)
     farthest = seen.depth.new_zeros(len(points)).scatter_reduce(0, seen.point, seen.depth, "amax")
     footprint = (2 * OCCLUSION_RADIUS + 1) * farthest[seen.point] / seen.depth
     counts = torch.bincount(seen.view, minlength=len(views)).tolist()
@@ -276,8 +276,15 @@ def _patch_means(images: Tensor, view: Tensor, pixel: Tensor, side: Tensor) -> T
     return (total / ((right - left) * (bottom - top))[:, None]).float()
 
 
-def _visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[int, int]) -> _Sights:
-    """The points that views see."""
+def visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[int, int]) -> Sights:
+    """The points that views see: those that no nearer one within OCCLUSION_RADIUS hides.
+
+    Args:
+        points: [N, 3], world units.
+        views: of one size.
+        reduction: photo pixels a working pixel.
+        size: height and width of the working frame.
+    """
     height, width = size
     side = 2 * OCCLUSION_RADIUS + 1
     found = []
@@ -292,4 +299,4 @@ def _visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[
         nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
         seen = (depth <= nearest.flatten()[place] * (1 + OCCLUSION_TOLERANCE)).nonzero()[:, 0]
         found.append([each[seen] for each in (view + first, point, pixel, position, depth)])
-    return _Sights(*(torch.cat(each) for each in zip(*found, strict=True)))
+    return Sights(*(torch.cat(each) for each in zip(*found, strict=True)))

@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 from torch.nn import Parameter
 
-from ssa_nerfstudio.evidence.distant_points import DistantPoints
+from ssa_nerfstudio.evidence.seeds import Seeds
 from ssa_nerfstudio.overlay.compositing import clip_straight_through, composite
 from ssa_nerfstudio.overlay.resampling import straight_color
 from ssa_nerfstudio.plugin.artifacts import Artifacts
@@ -148,8 +148,8 @@ class SSASplatfactoModel(PhotoLosses):
         if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
         if len(self.artifacts.backdrop):
-            backdrop = DistantPoints.of_table(self.artifacts.backdrop)
-            seed_points.add_distant(backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
+            backdrop = Seeds.of_table(self.artifacts.backdrop)
+            seed_points.add_seeds(backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
             self.artifacts.backdrop = self.artifacts.backdrop[:0]  # a training that goes on has them already
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]

@@ -24,8 +24,8 @@ from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.plugin.camera_matching import describe, describe_lenses, group_cameras, tell_of_fisheyes
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager, SSADatamanagerConfig
 from ssa_nerfstudio.plugin.decisions import tell
-from ssa_nerfstudio.plugin.distant_seeds import find_distant_seeds
 from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_from_points
+from ssa_nerfstudio.plugin.extra_seeds import find_extra_seeds
 from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
@@ -34,7 +34,7 @@ from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, lear
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.densification import gaussian_budget
-from ssa_nerfstudio.plugin.training.seed_points import add_distant, nearest_depth
+from ssa_nerfstudio.plugin.training.seed_points import add_seeds, nearest_depth
 from ssa_nerfstudio.plugin.triton_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
 from ssa_nerfstudio.plugin.view_geometry import view_matrix
@@ -109,23 +109,28 @@ class SSAPipeline(VanillaPipeline):
             by_photos = self.config.model.exposure_place == "auto"
             start_beside_artifact(self.model.exposure, self.model.artifacts, samples, by_photos)
         self._set_near_plane()
-        self._add_distant_seeds(photos)
+        self._add_extra_seeds(photos)
         self._set_budget()
         self.model.examine(self.datamanager)
 
-    def _add_distant_seeds(self, photos: list[dict[str, Any]]) -> None:
+    def _add_extra_seeds(self, photos: list[dict[str, Any]]) -> None:
         model, cameras = self.model, self.datamanager.train_dataset.cameras
         if self.config.artifacts_of:
             return  # a resumed run has its checkpoint's
-        found = find_distant_seeds(model.config, model.artifacts, photos, cameras, self._points(), model.exposure)
-        if found is not None:
-            add_distant(found[0], model.gauss_params, model.config.sh_degree)
-            model.artifacts.backdrop = found[1].table().to(model.device)
-            if len(found[0]):
+        found = find_extra_seeds(model.config, model.artifacts, photos, cameras, self._points(), model.exposure)
+        if found is None:
+            return
+        for seeds, what, setting in (
+            (found.distant, "distant points, where the photos show a sky or the like", "distant-seeds"),
+            (found.gaps, "points in gaps between the dataset's, at the depth of those around", "gap-seeds"),
+        ):
+            add_seeds(seeds, model.gauss_params, model.config.sh_degree)
+            if len(seeds):
                 tell(
-                    f"The scene also starts from {len(found[0]):,} distant points, where the photos show a sky or the "
-                    "like and the dataset has none. (--pipeline.model.distant-seeds False leaves them out.)"
+                    f"The scene also starts from {len(seeds):,} {what}. (--pipeline.model.{setting} False leaves them "
+                    "out.)"
                 )
+        model.artifacts.backdrop = found.backdrop.table().to(model.device)
 
     def _set_budget(self) -> None:
         config, cameras = self.config.model, self.datamanager.train_dataset.cameras

@@ -30,10 +30,12 @@ def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_sc
     assert as_it_is["T_off"] < 0.1 < 0.4 > as_it_is["T_on"], "a dashboard over a third of the frame"
     assert any(row["T_on"] != as_it_is["T_on"] for row in others)
     assert as_it_is["seeds"] == 0, "a room of walls"
-    assert all("seeds" in row for row in others if row["constant"].startswith("distant_points."))
+    assert as_it_is["gaps"] > 0, "between its points"
+    assert all("gaps" in row for row in others if row["constant"].startswith(("distant_points.", "gap_points.")))
     printed = capsys.readouterr().out
     assert printed.count("| layer_estimate.PRIOR_SCALE |") == 2
-    assert printed.count("| distant_points.SPACING | ") == 2
+    for constant in ("distant_points.SPACING", "gap_points.NEIGHBORS", "scene_photos.MIN_SHOWN"):
+        assert printed.count(f"| {constant} | ") == 2
 
 
 def test_what_is_not_drawn_on_a_clean_capture_is_an_error(write_built_in_scene, tmp_path, capsys):

@@ -11,15 +11,15 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence import distant_points as distant_points_module
 from ssa_nerfstudio.evidence.distant_points import (
-    MAX_VIEWS,
     SIGNIFICANCE,
-    DistantPoints,
     _directions,
     _distant,
     _significance,
     distant_points,
 )
 from ssa_nerfstudio.evidence.point_samples import View
+from ssa_nerfstudio.evidence.scene_photos import scene_photos
+from ssa_nerfstudio.evidence.seeds import Seeds
 
 HEIGHT, WIDTH = 60, 80
 K = torch.tensor([[70.0, 0.0, 40.0], [0.0, 70.0, 30.0], [0.0, 0.0, 1.0]])
@@ -58,14 +58,19 @@ def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = F
     return views
 
 
-def errors(found: DistantPoints) -> Tensor:
+def distant(points: Tensor, *photos: Any) -> tuple[Seeds, Seeds]:
+    """`distant_points` of photos, of which views, layers and groups are given."""
+    return distant_points(points, scene_photos(*photos))
+
+
+def errors(found: Seeds) -> Tensor:
     """[N]: of the points' colors against the sky's, seen from the cameras' mean."""
     center = torch.stack([-(v.world_to_camera[:3, :3].T @ v.world_to_camera[:3, 3]) for v in turning_views()]).mean(0)
     return (found.colors - sky(found.positions - center)).abs().amax(dim=-1)
 
 
 def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
-    found, _ = distant_points(GROUND, turning_views(), SIGHT, ONE)
+    found, _ = distant(GROUND, turning_views(), SIGHT, ONE)
     assert len(found.positions) > 200
     down = found.positions[:, 1] / found.positions.norm(dim=-1)
     assert down.max() < 0.1, "below the horizon the ground has points of its own"
@@ -73,17 +78,17 @@ def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
     distances = found.positions.norm(dim=-1)
     assert distances.min() > 2 * GROUND.norm(dim=-1).max()
     nearest = torch.cdist(found.positions, found.positions).fill_diagonal_(math.inf).amin(dim=1)
-    assert nearest.median() == pytest.approx(found.spacing, rel=0.2)
+    assert nearest.median() == pytest.approx(found.widths[0].item(), rel=0.2)
 
 
 def test_a_picture_that_stands_still_in_the_frame_is_not_far_away() -> None:
-    sky_seeds = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
-    assert len(distant_points(GROUND, turning_views(still=True), SIGHT, ONE)[0]) < 0.1 * sky_seeds
+    sky_seeds = len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
+    assert len(distant(GROUND, turning_views(still=True), SIGHT, ONE)[0]) < 0.1 * sky_seeds
 
 
 def test_colors_are_those_behind_a_film() -> None:
     T, B = torch.full((HEIGHT, WIDTH, 1), 0.7), torch.full((HEIGHT, WIDTH, 3), 0.2)
-    found, _ = distant_points(GROUND, turning_views((T, B)), [(T, B)] * 7, ONE)
+    found, _ = distant(GROUND, turning_views((T, B)), [(T, B)] * 7, ONE)
     assert len(found.positions) > 200
     assert errors(found).mean() < 0.03
 
@@ -91,8 +96,8 @@ def test_colors_are_those_behind_a_film() -> None:
 def test_the_sky_goes_on_behind_a_panel_without_its_color() -> None:
     hiding = torch.where(torch.arange(WIDTH)[:, None] < 30, 0.02, 1.0).expand(HEIGHT, WIDTH, 1)
     panel = (hiding, (1 - hiding) * torch.tensor([0.9, 0.1, 0.1]))
-    found, hidden = distant_points(GROUND, turning_views(panel), [panel] * 7, ONE)
-    without, nothing = distant_points(GROUND, turning_views(), SIGHT, ONE)
+    found, hidden = distant(GROUND, turning_views(panel), [panel] * 7, ONE)
+    without, nothing = distant(GROUND, turning_views(), SIGHT, ONE)
     assert not len(nothing)
     assert len(hidden) > 0.15 * len(without)
     assert len(found) + len(hidden) == pytest.approx(len(without), rel=0.1)
@@ -112,21 +117,21 @@ def test_a_wall_without_points_is_not_far_away() -> None:
         views.append(View(sky(torch.stack([across / 5, y * 0, y * 0 + 1], dim=-1)), None, pose, K))
     # Its points are at the sides, and no wider than the wall is far.
     points = torch.tensor([[side * (3.0 + 0.1 * i), 0.0, wall_at] for i in range(30) for side in (-1, 1)])
-    assert not len(distant_points(points, views, SIGHT, ONE)[0])
+    assert not len(distant(points, views, SIGHT, ONE)[0])
 
 
 def test_masked_pixels_and_gains_count() -> None:
-    plain, _ = distant_points(GROUND, turning_views(), SIGHT, ONE)
+    plain, _ = distant(GROUND, turning_views(), SIGHT, ONE)
     gain = torch.tensor([0.5, 0.8, 1.0])
     views = [View((v.image * gain * 65535).to(torch.int32).to(torch.uint16), None, v.world_to_camera, K, gain)
              for v in turning_views()]  # fmt: skip
-    assert torch.allclose(distant_points(GROUND, views, SIGHT, ONE)[0].colors, plain.colors, atol=1e-3)
+    assert torch.allclose(distant(GROUND, views, SIGHT, ONE)[0].colors, plain.colors, atol=1e-3)
     nothing = [View(v.image, torch.zeros(HEIGHT, WIDTH), v.world_to_camera, K) for v in views]
-    assert not any(map(len, distant_points(GROUND, nothing, SIGHT, ONE)))
+    assert not any(map(len, distant(GROUND, nothing, SIGHT, ONE)))
 
 
 def test_two_views_are_too_few() -> None:
-    assert not any(map(len, distant_points(GROUND, turning_views()[:2], SIGHT[:2], ONE[:2])))
+    assert not any(map(len, distant(GROUND, turning_views()[:2], SIGHT[:2], ONE[:2])))
 
 
 def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
@@ -136,7 +141,7 @@ def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
         View(v.image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(dim=(1, 3)), None, v.world_to_camera, small)
         for v in views[1::2]
     ]
-    found, _ = distant_points(GROUND, [*views[::2], *halves], SIGHT, ONE)
+    found, _ = distant(GROUND, [*views[::2], *halves], SIGHT, ONE)
     assert len(found.positions) > 100
     assert errors(found).mean() < 0.05
 
@@ -145,8 +150,8 @@ def test_cameras_with_a_still_picture_each_have_no_sky_together() -> None:
     """The mean over both would explain neither."""
     views = turning_views(still=True)
     other = [View(v.image.flip(1), None, v.world_to_camera, K) for v in views]
-    found, _ = distant_points(GROUND, [*views, *other], [None] * 14, [0] * 7 + [1] * 7)
-    assert len(found) < 0.1 * len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    found, _ = distant(GROUND, [*views, *other], [None] * 14, [0] * 7 + [1] * 7)
+    assert len(found) < 0.1 * len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
 
 
 @pytest.mark.parametrize("exposed", [True, False])
@@ -157,7 +162,7 @@ def test_a_gain_acts_on_the_artifact_or_on_the_scene_alone(exposed: bool) -> Non
     for v in turning_views():
         photo = gain * (T * v.image + B) if exposed else T * gain * v.image + B
         views.append(View(photo, None, v.world_to_camera, K, gain))
-    found, _ = distant_points(GROUND, views, [(T, B)] * 7, ONE, exposed)
+    found, _ = distant(GROUND, views, [(T, B)] * 7, ONE, exposed)
     assert len(found) > 200
     assert errors(found).mean() < 0.03
 
@@ -170,7 +175,7 @@ def test_far_hills_do_not_hide_a_sky() -> None:
         for v in turning_views()
     ]
     hills = torch.tensor([[0.0, 5.0, 300.0]]).expand(len(GROUND) // 49, 3)
-    assert len(distant_points(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200
+    assert len(distant(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200
 
 
 def test_leaves_that_hide_a_sky_from_some_views_leave_none_of_it_out() -> None:
@@ -188,8 +193,8 @@ def test_leaves_that_hide_a_sky_from_some_views_leave_none_of_it_out() -> None:
         photo = torch.where(leaf[..., None], torch.tensor([0.1, 0.2, 0.05]), view.image)
         views.append(View(photo, None, view.world_to_camera, K))
     assert 0.1 < torch.stack(hidden).mean() < 0.2, "the sky is half of the frame"
-    found, _ = distant_points(GROUND, views, SIGHT, ONE)
-    assert len(found) > 0.98 * len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    found, _ = distant(GROUND, views, SIGHT, ONE)
+    assert len(found) > 0.98 * len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
     assert errors(found).median() < 0.03
 
 
@@ -206,7 +211,7 @@ def test_noise_alone_is_not_far_away(noise: float, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     plain = [View(torch.full_like(v.image, 0.6), None, v.world_to_camera, K) for v in turning_views(step=0.5)]
     views = [noisy(view, generator, noise) for view in plain]
-    assert not len(distant_points(GROUND, views, SIGHT, ONE)[0])
+    assert not len(distant(GROUND, views, SIGHT, ONE)[0])
 
 
 def test_a_smooth_sky_is_found_below_noise() -> None:
@@ -216,7 +221,7 @@ def test_a_smooth_sky_is_found_below_noise() -> None:
     for view in turning_views():
         smooth = View(0.5 + 0.1 * (view.image - 0.5), None, view.world_to_camera, K)
         views.append(noisy(smooth, generator))
-    found, _ = distant_points(GROUND, views, SIGHT, ONE)
+    found, _ = distant(GROUND, views, SIGHT, ONE)
     assert len(found) > 200
     assert (found.positions[:, 1] / found.positions.norm(dim=-1)).max() < 0.1
 
@@ -224,23 +229,10 @@ def test_a_smooth_sky_is_found_below_noise() -> None:
 def test_small_groups_find_what_one_group_does() -> None:
     """Three cameras of seven views each, and of one view each, which cannot stand still."""
     views = [view for view in turning_views() for _ in range(3)]
-    one = len(distant_points(GROUND, views, [None] * 21, [0] * 21)[0])
+    one = len(distant(GROUND, views, [None] * 21, [0] * 21)[0])
     assert one > 200
     for groups in ([0, 1, 2] * 7, list(range(21))):
-        assert len(distant_points(GROUND, views, [None] * 21, groups)[0]) > 0.9 * one
-
-
-def test_no_more_views_are_read_than_the_most(monkeypatch: pytest.MonkeyPatch) -> None:
-    read, original = [], distant_points_module._scene_in
-
-    def counted(view: View, *arguments: Any) -> Any:
-        read.append(view)
-        return original(view, *arguments)
-
-    monkeypatch.setattr(distant_points_module, "_scene_in", counted)
-    views = turning_views() * 40
-    distant_points(GROUND[::50], views, [None] * 280, [number // 2 for number in range(280)])
-    assert MAX_VIEWS // 2 < len(read) <= MAX_VIEWS
+        assert len(distant(GROUND, views, [None] * 21, groups)[0]) > 0.9 * one
 
 
 def area(center: tuple[float, float], angle: float, width: float) -> Tensor:
@@ -292,6 +284,6 @@ def test_chance_is_as_significant_as_stated(views: int) -> None:
 
 def test_a_long_lens_has_fewer_directions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its pixels are smaller, and its directions are farther apart than two of them."""
-    found = len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0])
+    found = len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
     monkeypatch.setattr(distant_points_module, "MAX_DIRECTIONS", 4000)
-    assert 20 < len(distant_points(GROUND, turning_views(), SIGHT, ONE)[0]) < 0.5 * found
+    assert 20 < len(distant(GROUND, turning_views(), SIGHT, ONE)[0]) < 0.5 * found

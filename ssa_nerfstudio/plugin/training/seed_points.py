@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 
 import torch
 from gsplat.strategy.ops import _update_param_with_optimizer
@@ -11,8 +10,8 @@ from nerfstudio.models.splatfacto import RGB2SH
 from torch import Tensor
 from torch.nn import Parameter, ParameterDict
 
-from ssa_nerfstudio.evidence.distant_points import DistantPoints
 from ssa_nerfstudio.evidence.point_samples import project, regular_subset
+from ssa_nerfstudio.evidence.seeds import Seeds
 from ssa_nerfstudio.rasterization.constants import NEAR_PLANE
 
 _LOG = logging.getLogger(__name__)
@@ -64,32 +63,32 @@ def color_parameters(colors: Tensor, sh_degree: int) -> Tensor:
 
 
 @torch.no_grad()
-def add_distant(
-    points: DistantPoints,
+def add_seeds(
+    seeds: Seeds,
     params: ParameterDict,
     sh_degree: int,
     opacity: float | None = None,
     optimizers: dict[str, torch.optim.Optimizer] | None = None,
 ) -> None:
-    """Add Gaussians at distant points, round and as wide as the points are apart.
+    """Add Gaussians at seeds, round and as wide as these say.
 
     What no photo shows is added after the last step: densification would remove it.
 
     Args:
-        points: N of them.
+        seeds: N of them.
         params: of the model's Gaussians, at least one.
         sh_degree: the model's degree of spherical harmonics.
         opacity: in (0, 1); None: that of the first of the others.
         optimizers: of the parameters, by their names, so that a checkpoint can be resumed; None before they are built.
     """
-    count = len(points)
+    count = len(seeds)
     if not count:
         return
     new = {name: values.data.new_zeros(count, *values.shape[1:]) for name, values in params.items()}
-    new["means"].copy_(points.positions)
-    new["scales"].fill_(math.log(points.spacing))
+    new["means"].copy_(seeds.positions)
+    new["scales"].copy_(seeds.widths.log()[:, None].expand(count, 3))
     new["quats"][:, 0] = 1
-    new["features_dc"].copy_(color_parameters(points.colors, sh_degree))
+    new["features_dc"].copy_(color_parameters(seeds.colors, sh_degree))
     logit = params["opacities"].data[:1] if opacity is None else torch.tensor(opacity).logit()
     new["opacities"].copy_(logit.expand(count, 1))
     if optimizers is None:

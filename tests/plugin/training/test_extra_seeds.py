@@ -1,6 +1,6 @@
-"""Distant points become Gaussians: those that photos show before the first step, those that none shows after the last.
+"""Seeds become Gaussians: those that photos show before the first step, those that none shows after the last.
 
-What they are, tests/evidence/test_distant_points.py tests; here it is stated.
+What they are, tests/evidence/test_distant_points.py and test_gap_points.py test; here it is stated.
 """
 
 from __future__ import annotations
@@ -10,23 +10,28 @@ import math
 import pytest
 import torch
 
-from ssa_nerfstudio.evidence.distant_points import DistantPoints
-from ssa_nerfstudio.plugin import distant_seeds
+from ssa_nerfstudio.evidence.seeds import Seeds
+from ssa_nerfstudio.plugin import extra_seeds
 
-FOUND = DistantPoints(torch.tensor([[0.0, 0.0, 40.0], [1.0, 0.0, 40.0]]), torch.tensor([[0.2, 0.4, 0.9]] * 2), 1.0)
-HIDDEN = DistantPoints(torch.tensor([[0.0, 1.0, 40.0]]), torch.tensor([[0.9, 0.5, 0.1]]), 1.0)
+FOUND = Seeds(torch.tensor([[0.0, 0.0, 40.0], [1.0, 0.0, 40.0]]), torch.tensor([[0.2, 0.4, 0.9]] * 2), torch.ones(2))
+HIDDEN = Seeds(torch.tensor([[0.0, 1.0, 40.0]]), torch.tensor([[0.9, 0.5, 0.1]]), torch.tensor([1.5]))
+GAP = Seeds(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.3, 0.2, 0.1]]), torch.tensor([0.25]))
 
 
 @pytest.fixture
 def stated_points(monkeypatch):
-    """Calls of `distant_points`, which finds FOUND and HIDDEN."""
+    """Calls of `distant_points`, which finds FOUND and HIDDEN, and of `gap_points`, which finds GAP."""
     calls = []
 
-    def distant_points(points, views, layers, groups, exposed):
-        calls.append((points, views, layers, groups))
-        return FOUND, HIDDEN
+    def stated(found):
+        def points_of(points, photos):
+            calls.append((points, photos))
+            return found
 
-    monkeypatch.setattr(distant_seeds, "distant_points", distant_points)
+        return points_of
+
+    monkeypatch.setattr(extra_seeds, "distant_points", stated((FOUND, HIDDEN)))
+    monkeypatch.setattr(extra_seeds, "gap_points", stated(GAP))
     return calls
 
 
@@ -37,32 +42,42 @@ def started(scene, folder, configure_training, **settings):
 
 
 @pytest.mark.parametrize("strategy", ["adc", "mcmc"])
-def test_a_training_starts_from_distant_points_and_ends_with_a_backdrop(
+def test_a_training_starts_from_more_seeds_and_ends_with_a_backdrop(
     tiny_scene, tmp_path, configure_training, train_and_evaluate, stated_points, caplog, strategy: str
 ) -> None:
     caplog.set_level("INFO")
-    plain = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy, distant_seeds=False)
+    settings = {"overlay": "on", "strategy": strategy}
+    without = {"distant_seeds": False, "gap_seeds": False}
+    plain = started(tiny_scene, tmp_path, configure_training, **settings, **without)
     assert not stated_points
-    assert "distant points" not in caplog.text
-    model = started(tiny_scene, tmp_path, configure_training, overlay="on", strategy=strategy)
-    assert model.num_points == plain.num_points + 2
+    assert "also starts from" not in caplog.text
+    for kind, count in (("distant_seeds", 1), ("gap_seeds", 2)):
+        model = started(tiny_scene, tmp_path, configure_training, **settings, **{**without, kind: True})
+        assert model.num_points == plain.num_points + 3 - count
+        assert len(model.artifacts.backdrop) == 2 - count
+    stated_points.clear()
+    model = started(tiny_scene, tmp_path, configure_training, **settings)
+    assert model.num_points == plain.num_points + 3
     assert "starts from 2 distant points" in caplog.text
-    torch.testing.assert_close(model.means[-2:].detach().cpu(), FOUND.positions)
+    assert "starts from 1 points in gaps" in caplog.text
+    torch.testing.assert_close(model.means[-3:].detach().cpu(), torch.cat([FOUND.positions, GAP.positions]))
+    assert model.scales[-1].tolist() == pytest.approx([math.log(0.25)] * 3)
     assert model.opacities[-1].item() == pytest.approx(model.opacities[0].item())
-    [(points, views, layers, groups)] = stated_points
+    [(points, photos), (known, same)] = stated_points
     assert len(points) == plain.num_points
-    assert len(views) == len(layers) == 12
-    assert groups == [0] * 12
-    assert [tuple(layer.shape) for layer in layers[0]] == [(48, 64, 1), (48, 64, 3)]
+    assert len(known) == plain.num_points + 2, "a distant point is no gap"
+    assert same is photos
+    assert len(photos) == 12
+    assert [photo.group for photo in photos] == [0] * 12
 
-    settings = {"num_downscales": 0, "overlay": "on", "strategy": strategy}
+    settings = {"num_downscales": 0, **settings}
     config = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "run", 3, settings)
     _, pipeline, path = train_and_evaluate(config)
     trained = pipeline.model
-    assert trained.num_points == plain.num_points + 3, "too few steps for a refinement"
+    assert trained.num_points == plain.num_points + 4, "too few steps for a refinement"
     torch.testing.assert_close(trained.means[-1].detach().cpu(), HIDDEN.positions[0])
     assert trained.opacities[-1].sigmoid().item() == pytest.approx(0.99)
-    assert trained.scales[-1].tolist() == pytest.approx([math.log(HIDDEN.spacing)] * 3)
+    assert trained.scales[-1].tolist() == pytest.approx([math.log(1.5)] * 3)
     torch.testing.assert_close(trained.colors[-1].detach().cpu(), HIDDEN.colors[0])
 
     # A training that goes on has them already.
@@ -85,7 +100,7 @@ def test_a_run_that_was_stopped_ends_with_its_backdrop(
     resumed = configure_training("ssa-splatfacto", tiny_scene, tmp_path / "resumed", 3, settings)
     resumed.load_dir = trainer.checkpoint_dir
     _, pipeline, _ = train_and_evaluate(resumed)
-    assert len(stated_points) == 1
+    assert len(stated_points) == 2
     assert pipeline.model.num_points == before + 1
     torch.testing.assert_close(pipeline.model.means[-1].detach().cpu(), HIDDEN.positions[0])
 

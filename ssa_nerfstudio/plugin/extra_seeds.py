@@ -1,13 +1,17 @@
-"""Distant points of a capture behind its artifact, as the scene starts from them."""
+"""Seeds that structure from motion has not found: far away, in gaps, and behind what the artifact hides."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
-from ssa_nerfstudio.evidence.distant_points import DistantPoints, distant_points
+from ssa_nerfstudio.evidence.distant_points import distant_points
+from ssa_nerfstudio.evidence.gap_points import gap_points
+from ssa_nerfstudio.evidence.scene_photos import scene_photos
+from ssa_nerfstudio.evidence.seeds import Seeds
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.camera_matching import group_cameras
 from ssa_nerfstudio.plugin.exposure import Exposure
@@ -15,15 +19,27 @@ from ssa_nerfstudio.plugin.overlay_setup import views_of
 from ssa_nerfstudio.plugin.settings import ModelSettings
 
 
+@dataclass(frozen=True)
+class ExtraSeeds:
+    """What a training has beside the points of structure from motion."""
+
+    distant: Seeds
+    """A sky and the like."""
+    gaps: Seeds
+    """Between the points, at their depth."""
+    backdrop: Seeds
+    """Far away, hidden by the artifact in all photos: for the end of the training."""
+
+
 @torch.no_grad()
-def find_distant_seeds(
+def find_extra_seeds(
     config: ModelSettings,
     artifacts: Artifacts,
     photos: list[dict[str, Any]],
     cameras: Cameras,
     points: torch.Tensor | None,
     exposure: Exposure | None,
-) -> tuple[DistantPoints, DistantPoints] | None:
+) -> ExtraSeeds | None:
     """Find them where an overlay is trained, which learns faster than splats that must first grow into the frame.
 
     Args:
@@ -35,9 +51,9 @@ def find_distant_seeds(
         exposure: of the photos, where it is learned.
 
     Returns:
-        What the photos show, and what they hide; None where nothing is looked for.
+        The seeds, on the device of the photos; None where nothing is looked for.
     """
-    wanted = config.distant_seeds and config.overlay_start == "points" and not config.random_init
+    wanted = (config.distant_seeds or config.gap_seeds) and config.overlay_start == "points" and not config.random_init
     if not wanted or not len(artifacts) or points is None or not len(points):
         return None
     gains = None if exposure is None else exposure.gains()
@@ -48,4 +64,8 @@ def find_distant_seeds(
     bare = group_cameras(cameras)[1]
     groups = [-1 - camera if group is None else group for camera, group in zip(bare, own, strict=True)]
     exposed = exposure is not None and exposure.place == "photo"
-    return distant_points(points.to(views[0].image.device), views, layers, groups, exposed)
+    of_scene = scene_photos(views, layers, groups, exposed)
+    points = points.to(views[0].image.device)
+    distant, backdrop = distant_points(points, of_scene) if config.distant_seeds else 2 * (Seeds.none(points),)
+    known = torch.cat([points, distant.positions])
+    return ExtraSeeds(distant, gap_points(known, of_scene) if config.gap_seeds else Seeds.none(points), backdrop)

@@ -1,0 +1,132 @@
+"""Seeds in gaps between a scene's points: at the depth of what is around, in the photos' colors, and not twice."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.gap_points import MAX_VIEWS, NEIGHBORS, SPACING, gap_points
+from ssa_nerfstudio.evidence.point_samples import View
+from ssa_nerfstudio.evidence.scene_photos import scene_photos
+from ssa_nerfstudio.evidence.seeds import Seeds
+
+HEIGHT, WIDTH = 90, 120
+K = torch.tensor([[100.0, 0.0, 60.0], [0.0, 100.0, 45.0], [0.0, 0.0, 1.0]])
+AT = 4.0
+"""Distance of a wall from the cameras, which look along z."""
+
+
+def pose(right: float = 0.0, forward: float = 0.0) -> Tensor:
+    """World to camera [4, 4]."""
+    matrix = torch.eye(4)
+    matrix[0, 3], matrix[2, 3] = -right, -forward
+    return matrix
+
+
+def color_of(x: Tensor, y: Tensor) -> Tensor:
+    """Of a wall, [..., 3] in [0, 1]."""
+    return torch.stack([0.5 + 0.1 * x, 0.5 + 0.1 * y, torch.full_like(x, 0.3)], dim=-1)
+
+
+def wall_view(matrix: Tensor, **others: Any) -> View:
+    """A photo of the wall."""
+    y, x = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
+    depth = AT + matrix[2, 3]
+    image = color_of((x - 60) / 100 * depth - matrix[0, 3], (y - 45) / 100 * depth)
+    return View(image, others.pop("mask", None), matrix, K, **others)
+
+
+def wall_points(gap: float = 1.0) -> Tensor:
+    """Points of the wall, dense but for a square of twice this size."""
+    across = torch.linspace(-4, 4, 161)
+    points = torch.cartesian_prod(across, across, torch.tensor([AT]))
+    return points[points[:, :2].abs().amax(dim=1) > gap]
+
+
+def gaps(points: Tensor, views: list[View], layers: Any = None) -> Seeds:
+    return gap_points(points, scene_photos(views, layers or [None] * len(views), [0] * len(views)))
+
+
+def test_a_gap_is_filled_at_the_depth_around_it_in_the_photos_colors() -> None:
+    seeds = gaps(wall_points(), [wall_view(pose())])
+    across = 2 * 100 / AT / SPACING
+    assert 0.6 * across**2 < len(seeds) <= across**2
+    assert seeds.positions[:, :2].abs().amax() < 1
+    torch.testing.assert_close(seeds.positions[:, 2], torch.full((len(seeds),), AT))
+    torch.testing.assert_close(seeds.colors, color_of(*seeds.positions[:, :2].unbind(dim=1)), atol=1e-4, rtol=0)
+    nearest = torch.cdist(seeds.positions, seeds.positions).fill_diagonal_(math.inf).amin(dim=1)
+    torch.testing.assert_close(seeds.widths, nearest, rtol=1e-3, atol=0)
+    assert not len(gaps(wall_points(gap=0.0), [wall_view(pose())])), "there is none"
+
+
+def test_what_one_photo_has_filled_the_next_ones_leave() -> None:
+    """From another place, and from nearer, where it has a larger gap between seeds, too."""
+    one = len(gaps(wall_points(), [wall_view(pose())]))
+    assert len(gaps(wall_points(), [wall_view(pose())] * 2)) == one
+    views = [wall_view(pose()), wall_view(pose(right=0.7)), wall_view(pose(right=-0.7))]
+    assert len(gaps(wall_points(), views)) < 1.25 * one
+    nearer = gaps(wall_points(), [wall_view(pose()), wall_view(pose(forward=AT / 2))])
+    assert len(nearer) > 1.5 * one
+    torch.testing.assert_close(nearer.positions[:, 2], torch.full((len(nearer),), AT))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7])
+def test_a_floor_is_filled_between_its_sides(angle: float) -> None:
+    """Its depth is that of the sides in the same row; cameras have any pose."""
+    turn = torch.tensor(
+        [[math.cos(angle), 0, math.sin(angle)], [0, 1, 0], [-math.sin(angle), 0, math.cos(angle)]], dtype=torch.float32
+    )
+    generator = torch.Generator().manual_seed(0)
+    pixel = torch.rand(700, 2, generator=generator) * torch.tensor([WIDTH, HEIGHT - 58]) + torch.tensor([0, 58])
+    depth = 100 / (pixel[:, 1] - 45)
+    points = torch.stack([(pixel[:, 0] - 60) / 100 * depth, torch.ones_like(depth), depth - 0.3], dim=-1)
+    points = points[points[:, 0].abs() > 0.6]
+    matrix = torch.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, torch.tensor([0.0, 0.0, 0.3])
+    view = View(torch.full((HEIGHT, WIDTH, 3), 0.4), torch.ones(HEIGHT, WIDTH), matrix, K)
+    view.mask[:58] = 0  # above the horizon
+    seeds = gaps(points @ turn, [view])
+    assert len(seeds) > 20
+    height = seeds.positions @ turn.T
+    assert (height[:, 1] - 1).abs().median() < 0.1
+    assert height[:, 0].abs().median() < 0.6
+
+
+def test_what_an_artifact_or_a_mask_hides_is_left_to_other_photos() -> None:
+    left = torch.where(torch.arange(WIDTH)[:, None] < 60, 0.1, 1.0).expand(HEIGHT, WIDTH, 1)
+    panel = (left, 1 - left.expand(HEIGHT, WIDTH, 3))
+    photo = wall_view(pose())
+    behind = View(photo.image * panel[0] + panel[1], None, photo.world_to_camera, K)
+    mask = torch.ones(HEIGHT, WIDTH)
+    mask[:, :60] = 0
+    everything = len(gaps(wall_points(), [photo]))
+    for views, layers in (([behind], [panel]), ([wall_view(pose(), mask=mask)], None)):
+        seeds = gaps(wall_points(), views, layers)
+        assert 0.3 * everything < len(seeds) < 0.6 * everything
+        assert seeds.positions[:, 0].min() > 0
+        torch.testing.assert_close(seeds.colors, color_of(*seeds.positions[:, :2].unbind(dim=1)), atol=1e-3, rtol=0)
+    assert len(gaps(wall_points(), [behind, photo], [panel, None])) > 0.9 * everything
+
+
+def test_a_few_points_before_a_gap_do_not_bring_it_near() -> None:
+    """The plane through neighbors is theirs only right beside them."""
+    stray = torch.tensor([[0.3, 0.0, 1.0]])
+    seeds = gaps(torch.cat([wall_points(), stray]), [wall_view(pose())])
+    assert ((seeds.positions[:, 2] - AT).abs() < 0.01).float().mean() > 0.95
+
+
+def test_without_enough_points_there_is_no_depth() -> None:
+    assert not len(gaps(wall_points()[: NEIGHBORS - 1], [wall_view(pose())]))
+    away = torch.tensor([[0.0, 0.0, -AT]]).expand(50, 3)
+    assert not len(gaps(away, [wall_view(pose())]))
+
+
+def test_no_more_photos_are_read_than_the_most() -> None:
+    views = [wall_view(pose(right=30.0 * number)) for number in range(3 * MAX_VIEWS)]
+    points = torch.cat([wall_points()[::50] + torch.tensor([30.0 * number, 0, 0]) for number in range(3 * MAX_VIEWS)])
+    places = (gaps(points, views).positions[:, 0] / 30).round().unique()
+    assert MAX_VIEWS // 2 < len(places) <= MAX_VIEWS

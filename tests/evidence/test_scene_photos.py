@@ -1,0 +1,40 @@
+"""What photos show of the scene: which are read, and that the layers of each are its own."""
+
+from __future__ import annotations
+
+import torch
+
+from ssa_nerfstudio.evidence.point_samples import View
+from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS, MIN_SHOWN, scene_photos
+
+HEIGHT, WIDTH = 12, 16
+
+
+def view(color: float, mask: torch.Tensor | None = None) -> View:
+    return View(torch.full((HEIGHT, WIDTH, 3), color), mask, torch.eye(4), torch.eye(3))
+
+
+def test_no_more_views_are_read_than_the_most_and_each_group_keeps_its_share() -> None:
+    photos = scene_photos([view(0.5)] * 280, [None] * 280, [number % 7 for number in range(280)])
+    assert MAX_VIEWS // 2 < len(photos) <= MAX_VIEWS
+    groups = [photo.group for photo in photos]
+    assert groups == sorted(groups)
+    assert all(groups.count(group) in (13, 14) for group in range(7))
+
+
+def test_the_scene_is_what_is_left_of_the_artifact_that_a_view_has() -> None:
+    T, B = torch.full((HEIGHT, WIDTH, 1), 0.8), torch.full((HEIGHT, WIDTH, 3), 0.1)
+    T[:, : WIDTH // 2] = 0.9 * MIN_SHOWN
+    mask = torch.ones(HEIGHT, WIDTH)
+    mask[0] = 0
+    film, nothing, masked = (
+        photo for photo in scene_photos([view(0.58), view(0.6), view(0.6, mask)], [(T, B), None, None], [0, 1, 1])
+    )
+    torch.testing.assert_close(film.color[:, WIDTH // 2 :], torch.full((HEIGHT, WIDTH // 2, 3), 0.6))
+    assert film.shown[:, WIDTH // 2 :].all()
+    assert not film.shown[:, : WIDTH // 2].any()
+    torch.testing.assert_close(nothing.color, torch.full((HEIGHT, WIDTH, 3), 0.6))
+    assert nothing.shown.all()
+    assert masked.shown[1:].all()
+    assert not masked.shown[0].any()
+    assert film.size == (HEIGHT, WIDTH)
