@@ -10,7 +10,7 @@ from nerfstudio.cameras.cameras import Cameras
 
 from ssa_nerfstudio.evidence.distant_points import distant_points
 from ssa_nerfstudio.evidence.gap_points import gap_points
-from ssa_nerfstudio.evidence.scene_photos import scene_photos
+from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, scene_photos
 from ssa_nerfstudio.evidence.seeds import Seeds
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.camera_matching import group_cameras
@@ -56,6 +56,18 @@ def find_extra_seeds(
     wanted = (config.distant_seeds or config.gap_seeds) and config.overlay_start == "points" and not config.random_init
     if not wanted or not len(artifacts) or points is None or not len(points):
         return None
+    of_scene = photos_of_scene(artifacts, photos, cameras, exposure)
+    points = points.to(of_scene[0].color.device)
+    distant, backdrop = distant_points(points, of_scene) if config.distant_seeds else 2 * (Seeds.none(points),)
+    known = torch.cat([points, distant.positions])
+    return ExtraSeeds(distant, gap_points(known, of_scene) if config.gap_seeds else Seeds.none(points), backdrop)
+
+
+@torch.no_grad()
+def photos_of_scene(
+    artifacts: Artifacts, photos: list[dict[str, Any]], cameras: Cameras, exposure: Exposure | None
+) -> list[ScenePhoto]:
+    """Photos without the artifact that each has, for arguments as of `find_extra_seeds`."""
     gains = None if exposure is None else exposure.gains()
     views = views_of(photos, cameras, gains)
     of_groups = [artifacts[group].layers() for group in range(len(artifacts))]
@@ -64,8 +76,4 @@ def find_extra_seeds(
     bare = group_cameras(cameras)[1]
     groups = [-1 - camera if group is None else group for camera, group in zip(bare, own, strict=True)]
     exposed = exposure is not None and exposure.place == "photo"
-    of_scene = scene_photos(views, layers, groups, exposed)
-    points = points.to(views[0].image.device)
-    distant, backdrop = distant_points(points, of_scene) if config.distant_seeds else 2 * (Seeds.none(points),)
-    known = torch.cat([points, distant.positions])
-    return ExtraSeeds(distant, gap_points(known, of_scene) if config.gap_seeds else Seeds.none(points), backdrop)
+    return scene_photos(views, layers, groups, exposed)

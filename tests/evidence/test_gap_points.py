@@ -87,9 +87,8 @@ def test_a_floor_is_filled_between_its_sides(angle: float) -> None:
     points = points[points[:, 0].abs() > 0.6]
     matrix = torch.eye(4)
     matrix[:3, :3], matrix[:3, 3] = turn, torch.tensor([0.0, 0.0, 0.3])
-    view = View(torch.full((HEIGHT, WIDTH, 3), 0.4), torch.ones(HEIGHT, WIDTH), matrix, K)
-    view.mask[:58] = 0  # above the horizon
-    seeds = gaps(points @ turn, [view])
+    below_horizon = (torch.arange(HEIGHT)[:, None] >= 58).float().expand(HEIGHT, WIDTH)
+    seeds = gaps(points @ turn, [View(torch.full((HEIGHT, WIDTH, 3), 0.4), below_horizon, matrix, K)])
     assert len(seeds) > 20
     height = seeds.positions @ turn.T
     assert (height[:, 1] - 1).abs().median() < 0.1
@@ -117,6 +116,10 @@ def test_a_few_points_before_a_gap_do_not_bring_it_near() -> None:
     stray = torch.tensor([[0.3, 0.0, 1.0]])
     seeds = gaps(torch.cat([wall_points(), stray]), [wall_view(pose())])
     assert ((seeds.positions[:, 2] - AT).abs() < 0.01).float().mean() > 0.95
+
+
+def test_a_photo_of_which_nothing_is_seen_says_nothing() -> None:
+    assert not len(gaps(wall_points(), [wall_view(pose(), mask=torch.zeros(HEIGHT, WIDTH))]))
 
 
 def test_without_enough_points_there_is_no_depth() -> None:
