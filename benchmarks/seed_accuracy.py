@@ -16,7 +16,7 @@ from record_game import TALL, UNIT
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.distant_points import distant_points
+from ssa_nerfstudio.evidence.distant_points import distant_points, horizon
 from ssa_nerfstudio.evidence.gap_points import SPACING, gap_points
 from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, pixels_of
 
@@ -94,14 +94,14 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
         return 1 / depth, solid
 
     points = outputs.metadata["points3D_xyz"]
-    distant = distant_points(points, photos)[0]
+    distant = distant_points(points, photos)
     seen, sky = np.zeros(len(distant)), np.zeros(len(distant))
     for photo in photos:
         index = pixels_of(distant.positions, photo)[0]
         if len(index):
             seen[index.numpy()] += 1
             sky[index.numpy()] += ~trace(photo, distant.positions[index])[1]
-    gaps = gap_points(torch.cat([points, distant.positions]), photos)
+    gaps = gap_points(torch.cat([points, distant.positions]), photos, horizon(points, photos))[0]
     ratios = np.full(len(gaps), np.nan)
     for photo in photos:
         # A seed is as wide as SPACING working pixels of the photo that it fills.

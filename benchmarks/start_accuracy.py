@@ -25,7 +25,7 @@ from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import Detection, detect
-from ssa_nerfstudio.evidence.distant_points import distant_points
+from ssa_nerfstudio.evidence.distant_points import distant_points, horizon
 from ssa_nerfstudio.evidence.gap_points import gap_points
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
@@ -170,9 +170,9 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             detection, found, layers = own = own or start(False)
             with _scaled(constant, factor):
                 photos = scene_photos(views, [layers] * len(views), [0] * len(views))
-                shown, hidden = distant_points(points, photos)
-                gaps = gap_points(torch.cat([points, shown.positions]), photos)
-            seeds = {"seeds": len(shown), "backdrop": len(hidden), "gaps": len(gaps)}
+                distant, far = distant_points(points, photos), horizon(points, photos)
+                gaps, hidden = gap_points(torch.cat([points, distant.positions]), photos, far)
+            seeds = {"seeds": len(distant), "gaps": len(gaps), "backdrop": len(hidden)}
         else:
             with _scaled(constant, factor):
                 detection, found, layers = start(module in DETECTION)

@@ -53,7 +53,7 @@ _Place = TypeVar("_Place", int, Tensor)
 
 
 @torch.no_grad()
-def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> tuple[Seeds, Seeds]:
+def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
     """Find directions in which the photos show something far away, and no point is seen.
 
     A direction is a candidate if half of the views that show it see none of the scene's points around it. If it is far
@@ -62,24 +62,21 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> tuple[Seeds,
     compared view by view: patches that an alternative explains better, by a one-sided t-test over the views, are left
     out, and a connected area of the others is far away if that explains it better than each of the nearer distances, by
     the same test, and it does not stand still. Where cameras are too close together for any parallax, nothing speaks
-    against it. Costs are robust, because something nearer may hide a direction from some of the views. A direction that
-    fewer than MIN_SIGHTS of the views show, because of an artifact or a mask, continues what is seen nearest to it.
+    against it. Costs are robust, because something nearer may hide a direction from some of the views.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
         photos: at least one.
 
     Returns:
-        The seeds that photos show, and those that they hide, on the device of the scene's points; there may be none.
+        The seeds, on the device of the scene's points; there may be none.
     """
     points = regular_subset(points, len(photos))
-    poses = torch.stack([photo.view.world_to_camera for photo in photos])
-    cameras = -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0].to(points)
+    cameras = _cameras(photos).to(points)
     center = cameras.mean(dim=0)
     baseline = float((cameras - center).norm(dim=1).max())
-    distances = (points - center).norm(dim=1)
-    nearer = [float(distances.kthvalue(math.ceil(share * len(points))).values) for share in NEARER]
-    radius = DISTANCE * nearer[-1]
+    nearer = [_distance(points, center, share) for share in NEARER]
+    radius = horizon(points, photos)
     angles = [photo.reduction / float(photo.view.intrinsics[0, 0]) for photo in photos]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
@@ -90,24 +87,31 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> tuple[Seeds,
     likely = shown & (far.counted >= MIN_SIGHTS) & (2 * far.counted >= far.shown)
     candidates = likely.nonzero()[:, 0]
     if not len(candidates):
-        return Seeds.none(points), Seeds.none(points)
+        return Seeds.none(points)
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
     cost, still = far.cost[candidates], far.still[candidates]
     alternatives = [_sights(center + at * directions[candidates], frames).cost for at in nearer]
     distant = _distant(directions[candidates], angle, cost - still, [cost - other for other in alternatives])
     found = torch.zeros_like(shown)
     found[candidates[distant]] = True
-    behind = ((far.in_frame >= MIN_SIGHTS) & ~shown).nonzero()[:, 0]
-    seen = shown.nonzero()[:, 0]
-    _, nearest = KDTree(directions[seen].cpu().numpy()).query(directions[behind].cpu().numpy())
-    source = seen[torch.from_numpy(np.asarray(nearest, dtype=np.int64)).to(seen)]
-    behind, source = behind[found[source]], source[found[source]]
-    width = radius * angle
-    visible, hidden = center + radius * directions[found], center + radius * directions[behind]
-    return (
-        Seeds(visible, far.median[found], visible.new_full((len(visible),), width)),
-        Seeds(hidden, far.median[source], hidden.new_full((len(hidden),), width)),
-    )
+    positions = center + radius * directions[found]
+    return Seeds(positions, far.median[found], positions.new_full((len(positions),), radius * angle))
+
+
+def horizon(points: Tensor, photos: Sequence[ScenePhoto]) -> float:
+    """Distance from the cameras' mean, world units, beyond all but a few points of the scene [P, 3]."""
+    return DISTANCE * _distance(points, _cameras(photos).mean(dim=0).to(points), NEARER[-1])
+
+
+def _cameras(photos: Sequence[ScenePhoto]) -> Tensor:
+    """Positions [V, 3]."""
+    poses = torch.stack([photo.view.world_to_camera for photo in photos])
+    return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
+
+
+def _distance(points: Tensor, center: Tensor, share: float) -> float:
+    """Of this share of the points the largest distance from a center."""
+    return float((points - center).norm(dim=1).kthvalue(math.ceil(share * len(points))).values)
 
 
 @dataclass(frozen=True)
@@ -129,8 +133,6 @@ class _Sights:
     """[N] int64: views that count."""
     shown: Tensor
     """[N] int64: views that show a position, near points or not."""
-    in_frame: Tensor
-    """[N] int64: views with a position in the frame."""
 
 
 def _distant(directions: Tensor, angle: float, beside_still: Tensor, beside_nearer: Sequence[Tensor]) -> Tensor:
@@ -234,7 +236,7 @@ def _sights(positions: Tensor, frames: Sequence[tuple[ScenePhoto, Tensor, Tensor
         shown = photo.shown.flatten().to(positions.device)[pixel]
         sights.append((index, torch.full_like(index, number), color, still, shown, shown & ~near[pixel]))
     index, view, color, still, shown, counts = (torch.cat(each) for each in zip(*sights, strict=True))
-    in_frame, shown = torch.bincount(index, minlength=count), torch.bincount(index[shown], minlength=count)
+    shown = torch.bincount(index[shown], minlength=count)
     counts = counts.nonzero()[:, 0]
     in_views = counts[torch.argsort(index[counts], stable=True)]
     index, view, color, still = index[in_views], view[in_views], color[in_views], still[in_views]
@@ -249,4 +251,4 @@ def _sights(positions: Tensor, frames: Sequence[tuple[ScenePhoto, Tensor, Tensor
         difference = (color - reference).abs().mean(dim=-1)
         cost[index, view] = difference / (difference + NOISE)
     costs[0, counted < MIN_SIGHTS] = torch.nan
-    return _Sights(median, costs[0], costs[1], counted, shown, in_frame)
+    return _Sights(median, costs[0], costs[1], counted, shown)

@@ -27,42 +27,62 @@ MAX_VIEWS = 32
 
 
 @torch.no_grad()
-def gap_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
-    """Fill what photos show between points. Photo by photo, with the seeds of those before as further points.
+def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: float) -> tuple[Seeds, Seeds]:
+    """Fill the frames between points, at their depth. Photo by photo, with the seeds of those before as further points.
+
+    Then what a photo hides, because of an artifact or a mask, where there are neither points nor seeds: probably no
+    photo shows it. It continues the colors around, behind everything, because splats that photos show may be there.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
         photos: at least one.
+        far: distance beyond the scene, world units.
 
     Returns:
-        The seeds, on the device of the points; there may be none.
+        The seeds that photos show, and those that they hide, on the device of the points; there may be none.
     """
     points = regular_subset(points, MAX_VIEWS)
-    found = [Seeds.none(points)]
-    for photo in photos[:: -(-len(photos) // MAX_VIEWS)]:
-        seeds = _seeds_in(photo, points)
-        points = torch.cat([points, seeds.positions])
-        found.append(seeds)
-    return Seeds.joined(*found)
+    photos = photos[:: -(-len(photos) // MAX_VIEWS)]
+    found = []
+    for hidden in (False, True):
+        parts = [Seeds.none(points)]
+        for photo in photos:
+            seeds = _seeds_in(photo, points, far if hidden else None)
+            points = torch.cat([points, seeds.positions])
+            parts.append(seeds)
+        found.append(Seeds.joined(*parts))
+    return found[0], found[1]
 
 
-def _seeds_in(photo: ScenePhoto, points: Tensor) -> Seeds:
-    """Those in the gaps of one photo."""
-    width, reduction = photo.size[1], photo.reduction
-    row, column = _gaps(points, photo)
-    seen = visible(points, [photo.view], reduction, photo.size)
-    if not len(row) or len(seen.pixel) < NEIGHBORS:
+def _seeds_in(photo: ScenePhoto, points: Tensor, far: float | None) -> Seeds:
+    """Those in the gaps of one photo, where it shows the scene, or far away, where it does not."""
+    hidden = far is not None
+    shown = photo.shown[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING, 0]
+    colors = photo.color[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING]
+    free = ~near_points(points, photo, SPACING)[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING]
+    gaps = (free & (shown != hidden).to(free.device)).nonzero()
+    seen = visible(points, [photo.view], photo.reduction, photo.size)
+    if not len(gaps) or len(seen.pixel) < NEIGHBORS or int(shown.sum()) < NEIGHBORS:
         return Seeds.none(points)
-    of_points = torch.stack([seen.pixel // width, seen.pixel % width], dim=-1)
-    depth = _depth(torch.stack([row, column], dim=-1), of_points, seen.depth)[:, None]
+    pixels = SPACING // 2 + SPACING * gaps
+    if far is None:
+        places = torch.stack([seen.pixel // photo.size[1], seen.pixel % photo.size[1]], dim=-1)
+        depth, color = _depth(pixels, places, seen.depth), colors[tuple(gaps.to(colors.device).mT)]
+    else:
+        around = _nearest(gaps, shown.nonzero()).to(colors.device)
+        depth, color = points.new_full((len(gaps),), far), colors[shown][around].mean(dim=1)
     pose, lens = photo.view.world_to_camera.to(points), photo.view.intrinsics.to(points)
     # On the host: on a GPU the inverse would load a library for it.
     inverse = torch.linalg.inv(photo.view.intrinsics.cpu()).to(points)
-    pixel = torch.stack([(column + 0.5) * reduction, (row + 0.5) * reduction, torch.ones_like(depth[:, 0])], dim=-1)
-    in_camera = depth * (pixel.to(points) @ inverse.mT)
-    positions = (in_camera - pose[:3, 3]) @ pose[:3, :3]
-    colors = photo.color[row.to(photo.color.device), column.to(photo.color.device)].to(points)
-    return Seeds(positions, colors, SPACING * reduction / lens[0, 0] * depth[:, 0])
+    place = torch.cat([(pixels.flip(-1) + 0.5) * photo.reduction, torch.ones_like(pixels[:, :1])], dim=-1)
+    positions = (depth[:, None] * (place.to(points) @ inverse.mT) - pose[:3, 3]) @ pose[:3, :3]
+    return Seeds(positions, color.to(points), SPACING * photo.reduction / lens[0, 0] * depth)
+
+
+def _nearest(gaps: Tensor, places: Tensor) -> Tensor:
+    """Indices [G, NEIGHBORS] of the pixels [M, 2] nearest to pixels [G, 2], on the device of these."""
+    _, nearest = KDTree(places.cpu().numpy()).query(gaps.cpu().numpy(), k=NEIGHBORS)
+    return torch.from_numpy(nearest).to(gaps.device)
 
 
 def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
@@ -70,8 +90,7 @@ def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
 
     The inverse depth of a plane is linear in the frame. It is not extrapolated beyond that of the neighbors.
     """
-    _, nearest = KDTree(places.cpu().numpy()).query(gaps.cpu().numpy(), k=NEIGHBORS)
-    nearest = torch.from_numpy(nearest).to(depths.device)
+    nearest = _nearest(gaps, places)
     inverse = 1 / depths[nearest]
     offset = (places[nearest] - gaps[:, None]).to(inverse)
     mean, middle = inverse.mean(dim=1), offset.mean(dim=1)
@@ -82,10 +101,3 @@ def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
     xx, yy = xx + flat, yy + flat
     slope = torch.stack([yy * x - xy * y, xx * y - xy * x], dim=-1) / (xx * yy - xy * xy)[:, None]
     return 1 / (mean - (slope * middle).sum(dim=-1)).clamp(inverse.amin(dim=1), inverse.amax(dim=1))
-
-
-def _gaps(points: Tensor, photo: ScenePhoto) -> tuple[Tensor, Tensor]:
-    """Rows and columns [G] of a grid of working pixels that show the scene, without points around, hidden or not."""
-    free = photo.shown[..., 0].to(points.device) & ~near_points(points, photo, SPACING)
-    row, column = free[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING].nonzero(as_tuple=True)
-    return SPACING // 2 + SPACING * row, SPACING // 2 + SPACING * column

@@ -36,7 +36,7 @@ class Artifacts(nn.Module):
     bare_keys: Tensor
     """[B, 6], cameras of the groups without an artifact."""
     backdrop: Tensor
-    """[N, 7], distant seeds that the artifact hides (`Seeds.table`), until the scene gets them at the end."""
+    """[N, 7], seeds of what no photo shows (`Seeds.table`), until the scene gets them at the end."""
 
     def __init__(self) -> None:
         super().__init__()

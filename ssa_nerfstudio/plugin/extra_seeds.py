@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from nerfstudio.cameras.cameras import Cameras
 
-from ssa_nerfstudio.evidence.distant_points import distant_points
+from ssa_nerfstudio.evidence.distant_points import distant_points, horizon
 from ssa_nerfstudio.evidence.gap_points import gap_points
 from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, scene_photos
 from ssa_nerfstudio.evidence.seeds import Seeds
@@ -28,7 +28,7 @@ class ExtraSeeds:
     gaps: Seeds
     """Between the points, at their depth."""
     backdrop: Seeds
-    """Far away, hidden by the artifact in all photos: for the end of the training."""
+    """Behind everything, where the artifact or a mask hides it: for the end of the training."""
 
 
 @torch.no_grad()
@@ -58,9 +58,11 @@ def find_extra_seeds(
         return None
     of_scene = photos_of_scene(artifacts, photos, cameras, exposure)
     points = points.to(of_scene[0].color.device)
-    distant, backdrop = distant_points(points, of_scene) if config.distant_seeds else 2 * (Seeds.none(points),)
+    nothing = Seeds.none(points)
+    distant = distant_points(points, of_scene) if config.distant_seeds else nothing
     known = torch.cat([points, distant.positions])
-    return ExtraSeeds(distant, gap_points(known, of_scene) if config.gap_seeds else Seeds.none(points), backdrop)
+    gaps, backdrop = gap_points(known, of_scene, horizon(points, of_scene)) if config.gap_seeds else (nothing, nothing)
+    return ExtraSeeds(distant, gaps, backdrop)
 
 
 @torch.no_grad()

@@ -58,7 +58,7 @@ def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = F
     return views
 
 
-def distant(points: Tensor, *photos: Any) -> tuple[Seeds, Seeds]:
+def distant(points: Tensor, *photos: Any) -> Seeds:
     """`distant_points` of photos, of which views, layers and groups are given."""
     return distant_points(points, scene_photos(*photos))
 
@@ -70,7 +70,7 @@ def errors(found: Seeds) -> Tensor:
 
 
 def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
-    found, _ = distant(GROUND, turning_views(), SIGHT, ONE)
+    found = distant(GROUND, turning_views(), SIGHT, ONE)
     assert len(found.positions) > 200
     down = found.positions[:, 1] / found.positions.norm(dim=-1)
     assert down.max() < 0.1, "below the horizon the ground has points of its own"
@@ -82,28 +82,24 @@ def test_a_sky_is_found_where_no_point_is_and_has_its_colors() -> None:
 
 
 def test_a_picture_that_stands_still_in_the_frame_is_not_far_away() -> None:
-    sky_seeds = len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
-    assert len(distant(GROUND, turning_views(still=True), SIGHT, ONE)[0]) < 0.1 * sky_seeds
+    sky_seeds = len(distant(GROUND, turning_views(), SIGHT, ONE))
+    assert len(distant(GROUND, turning_views(still=True), SIGHT, ONE)) < 0.1 * sky_seeds
 
 
 def test_colors_are_those_behind_a_film() -> None:
     T, B = torch.full((HEIGHT, WIDTH, 1), 0.7), torch.full((HEIGHT, WIDTH, 3), 0.2)
-    found, _ = distant(GROUND, turning_views((T, B)), [(T, B)] * 7, ONE)
+    found = distant(GROUND, turning_views((T, B)), [(T, B)] * 7, ONE)
     assert len(found.positions) > 200
     assert errors(found).mean() < 0.03
 
 
-def test_the_sky_goes_on_behind_a_panel_without_its_color() -> None:
+def test_a_sky_is_not_what_an_opaque_panel_shows() -> None:
     hiding = torch.where(torch.arange(WIDTH)[:, None] < 30, 0.02, 1.0).expand(HEIGHT, WIDTH, 1)
     panel = (hiding, (1 - hiding) * torch.tensor([0.9, 0.1, 0.1]))
-    found, hidden = distant(GROUND, turning_views(panel), [panel] * 7, ONE)
-    without, nothing = distant(GROUND, turning_views(), SIGHT, ONE)
-    assert not len(nothing)
-    assert len(hidden) > 0.15 * len(without)
-    assert len(found) + len(hidden) == pytest.approx(len(without), rel=0.1)
+    found = distant(GROUND, turning_views(panel), [panel] * 7, ONE)
+    assert 0.5 < len(found) / len(distant(GROUND, turning_views(), SIGHT, ONE)) < 0.85
     assert errors(found).mean() < 0.03
-    for colors in (found.colors, hidden.colors):
-        assert not ((colors[:, 0] > 0.88) & (colors[:, 1] < 0.15)).any(), "the panel's"
+    assert not ((found.colors[:, 0] > 0.88) & (found.colors[:, 1] < 0.15)).any(), "the panel's"
 
 
 def test_a_wall_without_points_is_not_far_away() -> None:
@@ -117,21 +113,21 @@ def test_a_wall_without_points_is_not_far_away() -> None:
         views.append(View(sky(torch.stack([across / 5, y * 0, y * 0 + 1], dim=-1)), None, pose, K))
     # Its points are at the sides, and no wider than the wall is far.
     points = torch.tensor([[side * (3.0 + 0.1 * i), 0.0, wall_at] for i in range(30) for side in (-1, 1)])
-    assert not len(distant(points, views, SIGHT, ONE)[0])
+    assert not len(distant(points, views, SIGHT, ONE))
 
 
 def test_masked_pixels_and_gains_count() -> None:
-    plain, _ = distant(GROUND, turning_views(), SIGHT, ONE)
+    plain = distant(GROUND, turning_views(), SIGHT, ONE)
     gain = torch.tensor([0.5, 0.8, 1.0])
     views = [View((v.image * gain * 65535).to(torch.int32).to(torch.uint16), None, v.world_to_camera, K, gain)
              for v in turning_views()]  # fmt: skip
-    assert torch.allclose(distant(GROUND, views, SIGHT, ONE)[0].colors, plain.colors, atol=1e-3)
+    assert torch.allclose(distant(GROUND, views, SIGHT, ONE).colors, plain.colors, atol=1e-3)
     nothing = [View(v.image, torch.zeros(HEIGHT, WIDTH), v.world_to_camera, K) for v in views]
-    assert not any(map(len, distant(GROUND, nothing, SIGHT, ONE)))
+    assert not len(distant(GROUND, nothing, SIGHT, ONE))
 
 
 def test_two_views_are_too_few() -> None:
-    assert not any(map(len, distant(GROUND, turning_views()[:2], SIGHT[:2], ONE[:2])))
+    assert not len(distant(GROUND, turning_views()[:2], SIGHT[:2], ONE[:2]))
 
 
 def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
@@ -141,7 +137,7 @@ def test_views_of_several_sizes_are_each_compared_with_their_own() -> None:
         View(v.image.reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(dim=(1, 3)), None, v.world_to_camera, small)
         for v in views[1::2]
     ]
-    found, _ = distant(GROUND, [*views[::2], *halves], SIGHT, ONE)
+    found = distant(GROUND, [*views[::2], *halves], SIGHT, ONE)
     assert len(found.positions) > 100
     assert errors(found).mean() < 0.05
 
@@ -150,8 +146,8 @@ def test_cameras_with_a_still_picture_each_have_no_sky_together() -> None:
     """The mean over both would explain neither."""
     views = turning_views(still=True)
     other = [View(v.image.flip(1), None, v.world_to_camera, K) for v in views]
-    found, _ = distant(GROUND, [*views, *other], [None] * 14, [0] * 7 + [1] * 7)
-    assert len(found) < 0.1 * len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
+    found = distant(GROUND, [*views, *other], [None] * 14, [0] * 7 + [1] * 7)
+    assert len(found) < 0.1 * len(distant(GROUND, turning_views(), SIGHT, ONE))
 
 
 @pytest.mark.parametrize("exposed", [True, False])
@@ -162,7 +158,7 @@ def test_a_gain_acts_on_the_artifact_or_on_the_scene_alone(exposed: bool) -> Non
     for v in turning_views():
         photo = gain * (T * v.image + B) if exposed else T * gain * v.image + B
         views.append(View(photo, None, v.world_to_camera, K, gain))
-    found, _ = distant(GROUND, views, [(T, B)] * 7, ONE, exposed)
+    found = distant(GROUND, views, [(T, B)] * 7, ONE, exposed)
     assert len(found) > 200
     assert errors(found).mean() < 0.03
 
@@ -175,7 +171,7 @@ def test_far_hills_do_not_hide_a_sky() -> None:
         for v in turning_views()
     ]
     hills = torch.tensor([[0.0, 5.0, 300.0]]).expand(len(GROUND) // 49, 3)
-    assert len(distant(torch.cat([GROUND, hills]), views, SIGHT, ONE)[0]) > 200
+    assert len(distant(torch.cat([GROUND, hills]), views, SIGHT, ONE)) > 200
 
 
 def test_leaves_that_hide_a_sky_from_some_views_leave_none_of_it_out() -> None:
@@ -193,8 +189,8 @@ def test_leaves_that_hide_a_sky_from_some_views_leave_none_of_it_out() -> None:
         photo = torch.where(leaf[..., None], torch.tensor([0.1, 0.2, 0.05]), view.image)
         views.append(View(photo, None, view.world_to_camera, K))
     assert 0.1 < torch.stack(hidden).mean() < 0.2, "the sky is half of the frame"
-    found, _ = distant(GROUND, views, SIGHT, ONE)
-    assert len(found) > 0.98 * len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
+    found = distant(GROUND, views, SIGHT, ONE)
+    assert len(found) > 0.98 * len(distant(GROUND, turning_views(), SIGHT, ONE))
     assert errors(found).median() < 0.03
 
 
@@ -211,7 +207,7 @@ def test_noise_alone_is_not_far_away(noise: float, seed: int) -> None:
     generator = torch.Generator().manual_seed(seed)
     plain = [View(torch.full_like(v.image, 0.6), None, v.world_to_camera, K) for v in turning_views(step=0.5)]
     views = [noisy(view, generator, noise) for view in plain]
-    assert not len(distant(GROUND, views, SIGHT, ONE)[0])
+    assert not len(distant(GROUND, views, SIGHT, ONE))
 
 
 def test_a_smooth_sky_is_found_below_noise() -> None:
@@ -221,7 +217,7 @@ def test_a_smooth_sky_is_found_below_noise() -> None:
     for view in turning_views():
         smooth = View(0.5 + 0.1 * (view.image - 0.5), None, view.world_to_camera, K)
         views.append(noisy(smooth, generator))
-    found, _ = distant(GROUND, views, SIGHT, ONE)
+    found = distant(GROUND, views, SIGHT, ONE)
     assert len(found) > 200
     assert (found.positions[:, 1] / found.positions.norm(dim=-1)).max() < 0.1
 
@@ -229,10 +225,10 @@ def test_a_smooth_sky_is_found_below_noise() -> None:
 def test_small_groups_find_what_one_group_does() -> None:
     """Three cameras of seven views each, and of one view each, which cannot stand still."""
     views = [view for view in turning_views() for _ in range(3)]
-    one = len(distant(GROUND, views, [None] * 21, [0] * 21)[0])
+    one = len(distant(GROUND, views, [None] * 21, [0] * 21))
     assert one > 200
     for groups in ([0, 1, 2] * 7, list(range(21))):
-        assert len(distant(GROUND, views, [None] * 21, groups)[0]) > 0.9 * one
+        assert len(distant(GROUND, views, [None] * 21, groups)) > 0.9 * one
 
 
 def area(center: tuple[float, float], angle: float, width: float) -> Tensor:
@@ -284,6 +280,6 @@ def test_chance_is_as_significant_as_stated(views: int) -> None:
 
 def test_a_long_lens_has_fewer_directions(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its pixels are smaller, and its directions are farther apart than two of them."""
-    found = len(distant(GROUND, turning_views(), SIGHT, ONE)[0])
+    found = len(distant(GROUND, turning_views(), SIGHT, ONE))
     monkeypatch.setattr(distant_points_module, "MAX_DIRECTIONS", 4000)
-    assert 20 < len(distant(GROUND, turning_views(), SIGHT, ONE)[0]) < 0.5 * found
+    assert 20 < len(distant(GROUND, turning_views(), SIGHT, ONE)) < 0.5 * found

@@ -18,6 +18,8 @@ HEIGHT, WIDTH = 90, 120
 K = torch.tensor([[100.0, 0.0, 60.0], [0.0, 100.0, 45.0], [0.0, 0.0, 1.0]])
 AT = 4.0
 """Distance of a wall from the cameras, which look along z."""
+FAR = 50.0
+"""Behind it."""
 
 
 def pose(right: float = 0.0, forward: float = 0.0) -> Tensor:
@@ -47,8 +49,14 @@ def wall_points(gap: float = 1.0) -> Tensor:
     return points[points[:, :2].abs().amax(dim=1) > gap]
 
 
+def filled(points: Tensor, views: list[View], layers: Any = None) -> tuple[Seeds, Seeds]:
+    """`gap_points` of views with these layers of an artifact each."""
+    return gap_points(points, scene_photos(views, layers or [None] * len(views), [0] * len(views)), FAR)
+
+
 def gaps(points: Tensor, views: list[View], layers: Any = None) -> Seeds:
-    return gap_points(points, scene_photos(views, layers or [None] * len(views), [0] * len(views)))
+    """Those that photos show."""
+    return filled(points, views, layers)[0]
 
 
 def test_a_gap_is_filled_at_the_depth_around_it_in_the_photos_colors() -> None:
@@ -95,20 +103,29 @@ def test_a_floor_is_filled_between_its_sides(angle: float) -> None:
     assert height[:, 0].abs().median() < 0.6
 
 
-def test_what_an_artifact_or_a_mask_hides_is_left_to_other_photos() -> None:
+@pytest.mark.parametrize("by", ["artifact", "mask"])
+def test_what_a_photo_hides_others_fill_or_a_backdrop_continues(by: str) -> None:
     left = torch.where(torch.arange(WIDTH)[:, None] < 60, 0.1, 1.0).expand(HEIGHT, WIDTH, 1)
-    panel = (left, 1 - left.expand(HEIGHT, WIDTH, 3))
     photo = wall_view(pose())
-    behind = View(photo.image * panel[0] + panel[1], None, photo.world_to_camera, K)
-    mask = torch.ones(HEIGHT, WIDTH)
-    mask[:, :60] = 0
-    everything = len(gaps(wall_points(), [photo]))
-    for views, layers in (([behind], [panel]), ([wall_view(pose(), mask=mask)], None)):
-        seeds = gaps(wall_points(), views, layers)
-        assert 0.3 * everything < len(seeds) < 0.6 * everything
-        assert seeds.positions[:, 0].min() > 0
-        torch.testing.assert_close(seeds.colors, color_of(*seeds.positions[:, :2].unbind(dim=1)), atol=1e-3, rtol=0)
-    assert len(gaps(wall_points(), [behind, photo], [panel, None])) > 0.9 * everything
+    if by == "artifact":
+        panel = (left, (1 - left) * torch.tensor([1.0, 0.0, 0.0]))
+        half = View(photo.image * panel[0] + panel[1], None, photo.world_to_camera, K)
+    else:
+        panel, half = None, wall_view(pose(), mask=(left[..., 0] == 1).float())
+    everything, nothing = filled(wall_points(), [photo])
+    assert not len(nothing)
+    shown, hidden = filled(wall_points(), [half], [panel])
+    assert 0.3 < len(shown) / len(everything) < 0.6
+    assert shown.positions[:, 0].min() > 0 > hidden.positions[:, 0].max()
+    assert 0.85 < (len(shown) + len(hidden)) / len(everything) <= 1, "but for the border, where seeds are near"
+    torch.testing.assert_close(shown.positions[:, 2], torch.full((len(shown),), AT), rtol=1e-3, atol=0)
+    torch.testing.assert_close(shown.colors, color_of(*shown.positions[:, :2].unbind(dim=1)), atol=1e-3, rtol=0)
+    torch.testing.assert_close(hidden.positions[:, 2], torch.full((len(hidden),), FAR))
+    across = hidden.positions * (AT / FAR)
+    torch.testing.assert_close(hidden.colors, color_of(*across[:, :2].unbind(dim=1)), atol=0.15, rtol=0)
+    shown, hidden = filled(wall_points(), [half, photo], [panel, None])
+    assert len(shown) > 0.9 * len(everything)
+    assert not len(hidden), "the other photo shows it"
 
 
 def test_a_few_points_before_a_gap_do_not_bring_it_near() -> None:
@@ -119,7 +136,7 @@ def test_a_few_points_before_a_gap_do_not_bring_it_near() -> None:
 
 
 def test_a_photo_of_which_nothing_is_seen_says_nothing() -> None:
-    assert not len(gaps(wall_points(), [wall_view(pose(), mask=torch.zeros(HEIGHT, WIDTH))]))
+    assert not any(map(len, filled(wall_points(), [wall_view(pose(), mask=torch.zeros(HEIGHT, WIDTH))])))
 
 
 def test_without_enough_points_there_is_no_depth() -> None:

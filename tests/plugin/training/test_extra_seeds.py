@@ -20,18 +20,18 @@ GAP = Seeds(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.3, 0.2, 0.1]]), to
 
 @pytest.fixture
 def stated_points(monkeypatch):
-    """Calls of `distant_points`, which finds FOUND and HIDDEN, and of `gap_points`, which finds GAP."""
+    """Calls of `distant_points`, which finds FOUND, and of `gap_points`, which finds GAP and HIDDEN."""
     calls = []
 
     def stated(found):
-        def points_of(points, photos):
+        def points_of(points, photos, *_):
             calls.append((points, photos))
             return found
 
         return points_of
 
-    monkeypatch.setattr(extra_seeds, "distant_points", stated((FOUND, HIDDEN)))
-    monkeypatch.setattr(extra_seeds, "gap_points", stated(GAP))
+    monkeypatch.setattr(extra_seeds, "distant_points", stated(FOUND))
+    monkeypatch.setattr(extra_seeds, "gap_points", stated((GAP, HIDDEN)))
     return calls
 
 
@@ -54,7 +54,7 @@ def test_a_training_starts_from_more_seeds_and_ends_with_a_backdrop(
     for kind, count in (("distant_seeds", 1), ("gap_seeds", 2)):
         model = started(tiny_scene, tmp_path, configure_training, **settings, **{**without, kind: True})
         assert model.num_points == plain.num_points + 3 - count
-        assert len(model.artifacts.backdrop) == 2 - count
+        assert len(model.artifacts.backdrop) == count - 1
     stated_points.clear()
     model = started(tiny_scene, tmp_path, configure_training, **settings)
     assert model.num_points == plain.num_points + 3
