@@ -7,12 +7,21 @@ meanwhile an overlay learns what they do not show.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.point_samples import regular_subset, visible
+from ssa_nerfstudio.evidence.point_samples import (
+    OCCLUSION_TOLERANCE,
+    View,
+    nearest_depths,
+    project,
+    regular_subset,
+    visible,
+    working_pixels,
+)
 from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, near_points
 from ssa_nerfstudio.evidence.seeds import Seeds
 
@@ -22,6 +31,8 @@ NEIGHBORS = 8
 """Visible points around a seed, through which a plane gives its depth."""
 FLATNESS = 0.1
 """Weight of a constant depth beside that plane's slope: neighbors on one line say nothing about the other direction."""
+CLEAR_BY = 2 * OCCLUSION_TOLERANCE
+"""A seed hides points of a photo if all those around it are farther by more than this share of its depth."""
 MAX_VIEWS = 32
 """Photos whose gaps are filled: neighboring ones show the same."""
 
@@ -29,6 +40,9 @@ MAX_VIEWS = 32
 @torch.no_grad()
 def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: float) -> tuple[Seeds, Seeds]:
     """Fill the frames between points, at their depth. Photo by photo, with the seeds of those before as further points.
+
+    A seed that hides points which another photo sees is at a wrong depth, as beside the outline of something near, and
+    is left out.
 
     Then what a photo hides, because of an artifact or a mask, where there are neither points nor seeds: probably no
     photo shows it. It continues the colors around, behind everything, because splats that photos show may be there.
@@ -43,15 +57,59 @@ def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: float) -> tupl
     """
     points = regular_subset(points, MAX_VIEWS)
     photos = photos[:: -(-len(photos) // MAX_VIEWS)]
-    found = []
+    spaces, found = _free_spaces(points, photos), []
     for hidden in (False, True):
         parts = [Seeds.none(points)]
         for photo in photos:
             seeds = _seeds_in(photo, points, far if hidden else None)
+            if not hidden and len(seeds):
+                seeds = seeds.subset(~_hide_points(seeds.positions, spaces))
             points = torch.cat([points, seeds.positions])
             parts.append(seeds)
         found.append(Seeds.joined(*parts))
     return found[0], found[1]
+
+
+@dataclass(frozen=True)
+class _FreeSpace:
+    """How far V photos of one size see."""
+
+    poses: Tensor
+    """World to camera [V, 4, 4]."""
+    lenses: Tensor
+    """Intrinsics [V, 3, 3]."""
+    size: tuple[int, int]
+    """Height and width of the working frame."""
+    reduction: int
+    """Photo pixels a working pixel."""
+    depths: Tensor
+    """[V, h w], to the nearest point around each working pixel; infinite where there is none."""
+
+
+def _free_spaces(points: Tensor, photos: Sequence[ScenePhoto]) -> list[_FreeSpace]:
+    """Of photos of each size."""
+    alike: dict[tuple[tuple[int, int], int], list[View]] = {}
+    for photo in photos:
+        alike.setdefault((photo.size, photo.reduction), []).append(photo.view)
+    spaces = []
+    for (size, reduction), views in alike.items():
+        poses = torch.stack([view.world_to_camera for view in views])
+        lenses = torch.stack([view.intrinsics for view in views])
+        camera, _, position, depth = project(points, poses, lenses, size[0] * reduction, size[1] * reduction)
+        depths = nearest_depths(camera, working_pixels(position, size, reduction), depth, (len(views), *size))
+        spaces.append(_FreeSpace(poses, lenses, size, reduction, depths))
+    return spaces
+
+
+def _hide_points(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
+    """[N] bool: whether a position [N, 3] is before all points around it in a photo that has some."""
+    hide = torch.zeros_like(positions[:, 0], dtype=torch.bool)
+    for space in spaces:
+        size = space.size[0] * space.reduction, space.size[1] * space.reduction
+        camera, index, position, depth = project(positions, space.poses, space.lenses, *size)
+        behind = space.depths[camera, working_pixels(position, space.size, space.reduction)]
+        hide[index[(behind > depth * (1 + CLEAR_BY)) & behind.isfinite()]] = True
+    return hide
 
 
 def _seeds_in(photo: ScenePhoto, points: Tensor, far: float | None) -> Seeds:

@@ -286,17 +286,27 @@ def visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[i
         size: height and width of the working frame.
     """
     height, width = size
-    side = 2 * OCCLUSION_RADIUS + 1
     found = []
     for first in range(0, len(views), VIEWS_AT_ONCE):
         some = views[first : first + VIEWS_AT_ONCE]
         poses, lenses = torch.stack([v.world_to_camera for v in some]), torch.stack([v.intrinsics for v in some])
         view, point, position, depth = project(points, poses, lenses, height * reduction, width * reduction)
         pixel = working_pixels(position, size, reduction)
-        place = view * (height * width) + pixel
-        nearest = torch.full((len(some) * height * width,), torch.inf, device=points.device, dtype=depth.dtype)
-        nearest = nearest.scatter_reduce(0, place, depth, "amin").reshape(-1, height, width)
-        nearest = -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS)
-        seen = (depth <= nearest.flatten()[place] * (1 + OCCLUSION_TOLERANCE)).nonzero()[:, 0]
+        nearest = nearest_depths(view, pixel, depth, (len(some), height, width))
+        seen = (depth <= nearest[view, pixel] * (1 + OCCLUSION_TOLERANCE)).nonzero()[:, 0]
         found.append([each[seen] for each in (view + first, point, pixel, position, depth)])
     return Sights(*(torch.cat(each) for each in zip(*found, strict=True)))
+
+
+def nearest_depths(view: Tensor, pixel: Tensor, depth: Tensor, size: tuple[int, int, int]) -> Tensor:
+    """Least depth within OCCLUSION_RADIUS of each working pixel, [V, h w]; infinite where there is none.
+
+    Args:
+        view, pixel, depth: of M points in views, [M] each.
+        size: number of views, height and width of the working frame.
+    """
+    views, height, width = size
+    nearest = torch.full((views * height * width,), torch.inf, device=depth.device, dtype=depth.dtype)
+    nearest = nearest.scatter_reduce(0, view * (height * width) + pixel, depth, "amin").reshape(-1, height, width)
+    side = 2 * OCCLUSION_RADIUS + 1
+    return -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS).flatten(1)

@@ -32,6 +32,10 @@ class Seeds:
         """All seeds of at least one part, in order."""
         return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in ("positions", "colors", "widths")))
 
+    def subset(self, which: Tensor) -> Seeds:
+        """Those of which `which` [N] is True."""
+        return Seeds(self.positions[which], self.colors[which], self.widths[which])
+
     def table(self) -> Tensor:
         """[N, 7], for a checkpoint: positions, colors and widths."""
         return torch.cat([self.positions, self.colors, self.widths[:, None]], dim=-1)

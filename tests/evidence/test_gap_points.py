@@ -139,6 +139,17 @@ def test_a_photo_of_which_nothing_is_seen_says_nothing() -> None:
     assert not any(map(len, filled(wall_points(), [wall_view(pose(), mask=torch.zeros(HEIGHT, WIDTH))])))
 
 
+def test_a_seed_that_hides_what_another_photo_sees_is_left_out() -> None:
+    """Beside a post the neighbors are on it, in front of a wall whose points another photo sees there."""
+    post = torch.cartesian_prod(torch.linspace(-0.22, -0.16, 8), torch.linspace(-1, 1, 80), torch.tensor([AT / 2]))
+    points = torch.cat([wall_points(gap=0.5), post])
+    alone, checked = (gaps(points, [wall_view(pose()), *others]) for others in ([], [wall_view(pose(right=-1.0))]))
+    alone_near, checked_near = (int((seeds.positions[:, 2] < 0.8 * AT).sum()) for seeds in (alone, checked))
+    assert alone_near > 5
+    assert checked_near < 0.3 * alone_near
+    assert len(checked) - checked_near >= len(alone) - alone_near, "those on the wall stay"
+
+
 def test_without_enough_points_there_is_no_depth() -> None:
     assert not len(gaps(wall_points()[: NEIGHBORS - 1], [wall_view(pose())]))
     away = torch.tensor([[0.0, 0.0, -AT]]).expand(50, 3)
