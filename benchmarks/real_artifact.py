@@ -4,7 +4,8 @@ There are no clean views to compare with, only an approximate mask of the artifa
 artifact. It is compared in the undistorted frame. The mean matte of the frame's upper third is printed, too: there is
 sky, which hardly changes from view to view and must not become artifact. With --beside-off also a training without an
 overlay, compared outside the mask: whatever stays in its place in every photo, as a car ahead does, the overlay takes,
-but test photos show it. Distant seeds come with the overlay; distant_seeds=False among the settings leaves them out.
+but test photos show it. Distant and gap seeds come with the overlay; distant_seeds=False and gap_seeds=False among the
+settings leave them out.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from record_game import TALL, UNIT
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.distant_points import distant_points, horizon
-from ssa_nerfstudio.evidence.gap_points import SPACING, gap_points
+from ssa_nerfstudio.evidence.gap_points import MAX_VIEWS, SPACING, gap_points
 from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, pixels_of
 
 STRETCH = UNIT * np.array([1, 1, TALL])
@@ -74,11 +74,8 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
     from ssa_nerfstudio.plugin.extra_seeds import photos_of_scene
 
     config = configure("ssa-splatfacto", path, Path("outputs"), 1)
-    config.pipeline.model.overlay, config.pipeline.model.distant_seeds, config.pipeline.model.gap_seeds = (
-        "on",
-        False,
-        False,
-    )
+    model = config.pipeline.model
+    model.overlay, model.distant_seeds, model.gap_seeds = "on", False, False
     pipeline = config.pipeline.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
     manager, outputs = pipeline.datamanager, pipeline.datamanager.train_dataparser_outputs
     photos = photos_of_scene(pipeline.model.artifacts, manager.cached_train, manager.train_dataset.cameras, None)
@@ -103,12 +100,13 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
             sky[index.numpy()] += ~trace(photo, distant.positions[index])[1]
     gaps = gap_points(torch.cat([points, distant.positions]), photos, horizon(points, photos))[0]
     ratios = np.full(len(gaps), np.nan)
-    for photo in photos:
+    for photo in photos[:: -(-len(photos) // MAX_VIEWS)]:
         # A seed is as wide as SPACING working pixels of the photo that it fills.
         pose, index = photo.view.world_to_camera.to(gaps.positions), pixels_of(gaps.positions, photo)[0]
         depth = (gaps.positions[index] @ pose[:3, :3].T + pose[:3, 3])[:, 2]
         stated = gaps.widths[index] * photo.view.intrinsics[0, 0] / (SPACING * photo.reduction)
-        index = index[((stated / depth - 1).abs() < 1e-4) & torch.from_numpy(np.isnan(ratios[index.numpy()]))]
+        own = (stated / depth - 1).abs() < 1e-4
+        index = index[own & torch.from_numpy(np.isnan(ratios[index.numpy()]))]
         if len(index):
             ratio, solid = trace(photo, gaps.positions[index])
             ratios[index.numpy()] = np.where(solid, ratio, 0.0)

@@ -72,11 +72,10 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
         The seeds, on the device of the scene's points; there may be none.
     """
     points = regular_subset(points, len(photos))
-    cameras = _cameras(photos).to(points)
-    center = cameras.mean(dim=0)
+    cameras, sphere = _cameras(photos).to(points), horizon(points, photos)
+    center, radius = sphere.center, sphere.radius
     baseline = float((cameras - center).norm(dim=1).max())
     nearer = [_distance(points, center, share) for share in NEARER]
-    radius = horizon(points, photos)
     angles = [photo.reduction / float(photo.view.intrinsics[0, 0]) for photo in photos]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
@@ -98,9 +97,29 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
     return Seeds(positions, far.median[found], positions.new_full((len(positions),), radius * angle))
 
 
-def horizon(points: Tensor, photos: Sequence[ScenePhoto]) -> float:
-    """Distance from the cameras' mean, world units, beyond all but a few points of the scene [P, 3]."""
-    return DISTANCE * _distance(points, _cameras(photos).mean(dim=0).to(points), NEARER[-1])
+@dataclass(frozen=True)
+class Sphere:
+    """Where distant points are."""
+
+    center: Tensor
+    """[3], mean of the cameras."""
+    radius: float
+    """World units."""
+
+    def depths(self, camera: Tensor, rays: Tensor) -> Tensor:
+        """Multiples [N] of rays [N, 3] by which they leave the sphere, from a camera [3] inside."""
+        offset, squares = camera - self.center, rays.square().sum(dim=-1)
+        along = rays @ offset / squares
+        # Of a scene of almost no points cameras may be outside.
+        radius = max(self.radius, 2 * float(offset.norm()))
+        inside = radius**2 - offset.square().sum()
+        return (along.square() + inside / squares).sqrt() - along
+
+
+def horizon(points: Tensor, photos: Sequence[ScenePhoto]) -> Sphere:
+    """The sphere beyond all but a few points of the scene [P, 3]."""
+    center = _cameras(photos).to(points).mean(dim=0)
+    return Sphere(center, DISTANCE * _distance(points, center, NEARER[-1]))
 
 
 def _cameras(photos: Sequence[ScenePhoto]) -> Tensor:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
+from ssa_nerfstudio.evidence.distant_points import Sphere
 from ssa_nerfstudio.evidence.point_samples import (
     OCCLUSION_TOLERANCE,
     View,
@@ -38,11 +40,11 @@ MAX_VIEWS = 32
 
 
 @torch.no_grad()
-def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: float) -> tuple[Seeds, Seeds]:
-    """Fill the frames between points, at their depth. Photo by photo, with the seeds of those before as further points.
+def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tuple[Seeds, Seeds]:
+    """Fill the frames between points, at their depth, photo by photo: what one has filled is no gap in the next.
 
-    A seed that hides points which another photo sees is at a wrong depth, as beside the outline of something near, and
-    is left out.
+    A seed that hides points in the frame of another photo is at a wrong depth, as beside the outline of something near,
+    and is left out.
 
     Then what a photo hides, because of an artifact or a mask, where there are neither points nor seeds: probably no
     photo shows it. It continues the colors around, behind everything, because splats that photos show may be there.
@@ -50,24 +52,74 @@ def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: float) -> tupl
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
         photos: at least one.
-        far: distance beyond the scene, world units.
+        far: beyond the scene.
 
     Returns:
         The seeds that photos show, and those that they hide, on the device of the points; there may be none.
     """
     points = regular_subset(points, MAX_VIEWS)
     photos = photos[:: -(-len(photos) // MAX_VIEWS)]
-    spaces, found = _free_spaces(points, photos), []
-    for hidden in (False, True):
-        parts = [Seeds.none(points)]
+    taken, spaces, found = points, _free_spaces(points, photos), []
+    for part in (_between, partial(_behind, far=far)):
+        seeds = [Seeds.none(points)]
         for photo in photos:
-            seeds = _seeds_in(photo, points, far if hidden else None)
-            if not hidden and len(seeds):
-                seeds = seeds.subset(~_hide_points(seeds.positions, spaces))
-            points = torch.cat([points, seeds.positions])
-            parts.append(seeds)
-        found.append(Seeds.joined(*parts))
+            seeds.append(part(photo, points, taken, spaces))
+            taken = torch.cat([taken, seeds[-1].positions])
+        found.append(Seeds.joined(*seeds))
     return found[0], found[1]
+
+
+def _between(photo: ScenePhoto, points: Tensor, taken: Tensor, spaces: Sequence[_FreeSpace]) -> Seeds:
+    """Seeds in the gaps that a photo shows, at the depth of its points [P, 3]."""
+    gaps = _gaps(photo, taken, photo.shown[..., 0])
+    seen = visible(points, [photo.view], photo.reduction, photo.size)
+    if not len(gaps) or len(seen.pixel) < NEIGHBORS:
+        return Seeds.none(points)
+    width = photo.size[1]
+    depth = _depth(gaps, torch.stack([seen.pixel // width, seen.pixel % width], dim=-1), seen.depth)
+    camera, rays = _rays(photo, gaps, points)
+    color = photo.color[tuple(gaps.to(photo.color.device).mT)]
+    seeds = Seeds(camera + depth[:, None] * rays, color.to(points), _width(photo) * depth)
+    return seeds.subset(~_hide_points(seeds.positions, spaces))
+
+
+def _behind(photo: ScenePhoto, points: Tensor, taken: Tensor, spaces: Sequence[_FreeSpace], far: Sphere) -> Seeds:
+    """Seeds far away in the gaps that a photo hides."""
+    gaps, shown = _gaps(photo, taken, ~photo.shown[..., 0]), _on_grid(photo.shown[..., 0]).nonzero()
+    if not len(gaps) or len(shown) < NEIGHBORS:
+        return Seeds.none(points)
+    around = shown[_nearest(gaps.to(shown.device), shown)]
+    color = photo.color[around[..., 0], around[..., 1]].mean(dim=1)
+    camera, rays = _rays(photo, gaps, points)
+    depth = far.depths(camera, rays)
+    return Seeds(camera + depth[:, None] * rays, color.to(points), _width(photo) * depth)
+
+
+def _gaps(photo: ScenePhoto, taken: Tensor, where: Tensor) -> Tensor:
+    """Row and column [G, 2] of those pixels of the grid, `where` [h, w] is True, that have no position [P, 3] around,
+    hidden or not."""
+    return _on_grid(where.to(taken.device) & ~near_points(taken, photo, SPACING)).nonzero()
+
+
+def _on_grid(mask: Tensor) -> Tensor:
+    """A mask [h, w] at every SPACING-th working pixel; elsewhere False."""
+    grid = torch.zeros_like(mask)
+    grid[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING] = mask[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING]
+    return grid
+
+
+def _rays(photo: ScenePhoto, pixels: Tensor, like: Tensor) -> tuple[Tensor, Tensor]:
+    """Position [3] of a camera, and rays [G, 3] of depth 1 through working pixels [G, 2], as a tensor is stored."""
+    # On the host: on a GPU the inverse would load a library for it.
+    inverse = torch.linalg.inv(photo.view.intrinsics.cpu()).to(like)
+    place = torch.cat([(pixels.flip(-1) + 0.5) * photo.reduction, torch.ones_like(pixels[:, :1])], dim=-1)
+    pose = photo.view.world_to_camera.to(like)
+    return -pose[:3, 3] @ pose[:3, :3], place.to(like) @ inverse.mT @ pose[:3, :3]
+
+
+def _width(photo: ScenePhoto) -> float:
+    """Distance of neighboring seeds at depth 1."""
+    return SPACING * photo.reduction / float(photo.view.intrinsics[0, 0])
 
 
 @dataclass(frozen=True)
@@ -102,7 +154,7 @@ def _free_spaces(points: Tensor, photos: Sequence[ScenePhoto]) -> list[_FreeSpac
 
 
 def _hide_points(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
-    """[N] bool: whether a position [N, 3] is before all points around it in a photo that has some."""
+    """[N] bool: whether a position [N, 3] is before all points around it in the frame of one of the photos."""
     hide = torch.zeros_like(positions[:, 0], dtype=torch.bool)
     for space in spaces:
         size = space.size[0] * space.reduction, space.size[1] * space.reduction
@@ -110,31 +162,6 @@ def _hide_points(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
         behind = space.depths[camera, working_pixels(position, space.size, space.reduction)]
         hide[index[(behind > depth * (1 + CLEAR_BY)) & behind.isfinite()]] = True
     return hide
-
-
-def _seeds_in(photo: ScenePhoto, points: Tensor, far: float | None) -> Seeds:
-    """Those in the gaps of one photo, where it shows the scene, or far away, where it does not."""
-    hidden = far is not None
-    shown = photo.shown[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING, 0]
-    colors = photo.color[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING]
-    free = ~near_points(points, photo, SPACING)[SPACING // 2 :: SPACING, SPACING // 2 :: SPACING]
-    gaps = (free & (shown != hidden).to(free.device)).nonzero()
-    seen = visible(points, [photo.view], photo.reduction, photo.size)
-    if not len(gaps) or len(seen.pixel) < NEIGHBORS or int(shown.sum()) < NEIGHBORS:
-        return Seeds.none(points)
-    pixels = SPACING // 2 + SPACING * gaps
-    if far is None:
-        places = torch.stack([seen.pixel // photo.size[1], seen.pixel % photo.size[1]], dim=-1)
-        depth, color = _depth(pixels, places, seen.depth), colors[tuple(gaps.to(colors.device).mT)]
-    else:
-        around = _nearest(gaps, shown.nonzero()).to(colors.device)
-        depth, color = points.new_full((len(gaps),), far), colors[shown][around].mean(dim=1)
-    pose, lens = photo.view.world_to_camera.to(points), photo.view.intrinsics.to(points)
-    # On the host: on a GPU the inverse would load a library for it.
-    inverse = torch.linalg.inv(photo.view.intrinsics.cpu()).to(points)
-    place = torch.cat([(pixels.flip(-1) + 0.5) * photo.reduction, torch.ones_like(pixels[:, :1])], dim=-1)
-    positions = (depth[:, None] * (place.to(points) @ inverse.mT) - pose[:3, 3]) @ pose[:3, :3]
-    return Seeds(positions, color.to(points), SPACING * photo.reduction / lens[0, 0] * depth)
 
 
 def _nearest(gaps: Tensor, places: Tensor) -> Tensor:
@@ -146,7 +173,8 @@ def _nearest(gaps: Tensor, places: Tensor) -> Tensor:
 def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
     """Depths [G] at pixels [G, 2], of planes through the NEIGHBORS nearest of pixels [M, 2] with depths [M].
 
-    The inverse depth of a plane is linear in the frame. It is not extrapolated beyond that of the neighbors.
+    The inverse depth of a plane is linear in the frame. It stays between those of the neighbors, of which the nearest
+    and the farthest may be wrong matches.
     """
     nearest = _nearest(gaps, places)
     inverse = 1 / depths[nearest]
@@ -158,4 +186,5 @@ def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
     flat = FLATNESS * (middle.square().sum(dim=-1) + (xx + yy) / NEIGHBORS)
     xx, yy = xx + flat, yy + flat
     slope = torch.stack([yy * x - xy * y, xx * y - xy * x], dim=-1) / (xx * yy - xy * xy)[:, None]
-    return 1 / (mean - (slope * middle).sum(dim=-1)).clamp(inverse.amin(dim=1), inverse.amax(dim=1))
+    ordered = inverse.sort(dim=1).values
+    return 1 / (mean - (slope * middle).sum(dim=-1)).clamp(ordered[:, 1], ordered[:, -2])

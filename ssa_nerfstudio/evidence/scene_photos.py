@@ -13,7 +13,7 @@ from ssa_nerfstudio.evidence.point_samples import View, project, working_pixels,
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
 
 MAX_VIEWS = 128
-"""Views that are read; of more a regular subset of each group."""
+"""Views that are read; of more a regular subset, group by group."""
 MIN_SHOWN = 0.5
 """Transmittance of the artifact below which a pixel does not count."""
 

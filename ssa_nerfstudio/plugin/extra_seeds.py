@@ -17,6 +17,7 @@ from ssa_nerfstudio.plugin.camera_matching import group_cameras
 from ssa_nerfstudio.plugin.exposure import Exposure
 from ssa_nerfstudio.plugin.overlay_setup import views_of
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.training.seed_points import outside_cameras
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class ExtraSeeds:
     gaps: Seeds
     """Between the points, at their depth."""
     backdrop: Seeds
-    """Behind everything, where the artifact or a mask hides it: for the end of the training."""
+    """Far away, where the artifact or a mask hides the scene: for the end of the training."""
 
 
 @torch.no_grad()
@@ -58,6 +59,7 @@ def find_extra_seeds(
         return None
     of_scene = photos_of_scene(artifacts, photos, cameras, exposure)
     points = points.to(of_scene[0].color.device)
+    points = points[outside_cameras(points, cameras.camera_to_worlds[:, :3, 3])]
     nothing = Seeds.none(points)
     distant = distant_points(points, of_scene) if config.distant_seeds else nothing
     known = torch.cat([points, distant.positions])

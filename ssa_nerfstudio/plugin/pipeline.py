@@ -120,15 +120,19 @@ class SSAPipeline(VanillaPipeline):
         found = find_extra_seeds(model.config, model.artifacts, photos, cameras, self._points(), model.exposure)
         if found is None:
             return
-        for seeds, what, setting in (
-            (found.distant, "distant points, where the photos show a sky or the like", "distant-seeds"),
-            (found.gaps, "points in gaps between the dataset's, at the depth of those around", "gap-seeds"),
+        for seeds, where, setting in (
+            (
+                found.distant,
+                "far away, where the photos show a sky or the like and the dataset has no points",
+                "distant",
+            ),
+            (found.gaps, "in gaps between the dataset's points, at the depth of those around", "gap"),
         ):
             add_seeds(seeds, model.gauss_params, model.config.sh_degree)
             if len(seeds):
                 tell(
-                    f"The scene also starts from {len(seeds):,} {what}. (--pipeline.model.{setting} False leaves them "
-                    "out.)"
+                    f"More Gaussians to start from: {len(seeds):,} {where}. (--pipeline.model.{setting}-seeds False "
+                    "leaves them out.)"
                 )
         model.artifacts.backdrop = found.backdrop.table().to(model.device)
 

@@ -59,13 +59,12 @@ class ModelSettings(SplatfactoModelConfig):
     the photos teach the scene nothing; False: they do."""
     distant_seeds: bool = True
     """Where an overlay is trained with overlay_start "points", or given: start also from Gaussians far away in
-    directions in which structure from motion has found no points, such as a sky, and the photos agree on a color; and
-    end with a backdrop where the artifact hides such a sky from all photos. False: without these. Not with
-    random_init."""
+    directions in which structure from motion has found no points, such as a sky, and the photos agree on a color.
+    False: without these. Not with random_init."""
     gap_seeds: bool = True
     """Where an overlay is trained with overlay_start "points", or given: start also from Gaussians where photos show no
-    points of structure from motion, such as plain walls and roads, at the depth of the points around them. False:
-    without these. Not with random_init."""
+    points of structure from motion, such as plain walls and roads, at the depth of the points around them; and end with
+    a backdrop where the artifact hides the scene from all photos. False: without these. Not with random_init."""
     strategy: Literal["auto", "adc", "mcmc"] = "auto"
     """Densification. adc: adaptive density control, splatfacto's; mcmc: up to a fixed number of Gaussians, cap_max;
     auto: mcmc where at least 7,000 steps are trained, adc in shorter trainings, where it is mostly ahead; a resumed run

@@ -70,7 +70,7 @@ def add_seeds(
     opacity: float | None = None,
     optimizers: dict[str, torch.optim.Optimizer] | None = None,
 ) -> None:
-    """Add Gaussians at seeds, round and as wide as these say.
+    """Add Gaussians at seeds, round and as wide as these say, with MCMC, too, which starts others smaller.
 
     What no photo shows is added after the last step: densification would remove it.
 

@@ -50,7 +50,7 @@ def test_a_training_starts_from_more_seeds_and_ends_with_a_backdrop(
     without = {"distant_seeds": False, "gap_seeds": False}
     plain = started(tiny_scene, tmp_path, configure_training, **settings, **without)
     assert not stated_points
-    assert "also starts from" not in caplog.text
+    assert "More Gaussians" not in caplog.text
     for kind, count in (("distant_seeds", 1), ("gap_seeds", 2)):
         model = started(tiny_scene, tmp_path, configure_training, **settings, **{**without, kind: True})
         assert model.num_points == plain.num_points + 3 - count
@@ -58,8 +58,8 @@ def test_a_training_starts_from_more_seeds_and_ends_with_a_backdrop(
     stated_points.clear()
     model = started(tiny_scene, tmp_path, configure_training, **settings)
     assert model.num_points == plain.num_points + 3
-    assert "starts from 2 distant points" in caplog.text
-    assert "starts from 1 points in gaps" in caplog.text
+    assert "start from: 2 far away" in caplog.text
+    assert "start from: 1 in gaps" in caplog.text
     torch.testing.assert_close(model.means[-3:].detach().cpu(), torch.cat([FOUND.positions, GAP.positions]))
     assert model.scales[-1].tolist() == pytest.approx([math.log(0.25)] * 3)
     assert model.opacities[-1].item() == pytest.approx(model.opacities[0].item())
