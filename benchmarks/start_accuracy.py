@@ -70,7 +70,7 @@ ESTIMATE = {
 """Those of the modules that estimate the layers."""
 SEEDS = {
     "distant_points": ("SPACING", "DISTANCE", "NOISE", "PATCH", "SIGNIFICANCE", "MIN_SIGHTS"),
-    "gap_points": ("SPACING", "NEIGHBORS", "MAX_VIEWS"),
+    "gap_points": ("SPACING", "NEIGHBORS", "FLATNESS", "CLEAR_BY", "MAX_VIEWS"),
     "scene_photos": ("MIN_SHOWN",),
 }
 """Those of the modules that find more seeds, behind the layers that were estimated."""

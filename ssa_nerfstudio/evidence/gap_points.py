@@ -41,7 +41,7 @@ MAX_VIEWS = 32
 
 @torch.no_grad()
 def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tuple[Seeds, Seeds]:
-    """Fill the frames between points, at their depth, photo by photo: what one has filled is no gap in the next.
+    """Fill the frames between points, at their depth, photo by photo, with the seeds of those before as further points.
 
     A seed that hides points in the frame of another photo is at a wrong depth, as beside the outline of something near,
     and is left out.
@@ -59,40 +59,40 @@ def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tup
     """
     points = regular_subset(points, MAX_VIEWS)
     photos = photos[:: -(-len(photos) // MAX_VIEWS)]
-    taken, spaces, found = points, _free_spaces(points, photos), []
-    for part in (_between, partial(_behind, far=far)):
+    taken, found = points, []
+    for part in (partial(_between, spaces=_free_spaces(points, photos)), partial(_behind, far=far)):
         seeds = [Seeds.none(points)]
         for photo in photos:
-            seeds.append(part(photo, points, taken, spaces))
+            seeds.append(part(photo, taken))
             taken = torch.cat([taken, seeds[-1].positions])
         found.append(Seeds.joined(*seeds))
     return found[0], found[1]
 
 
-def _between(photo: ScenePhoto, points: Tensor, taken: Tensor, spaces: Sequence[_FreeSpace]) -> Seeds:
-    """Seeds in the gaps that a photo shows, at the depth of its points [P, 3]."""
+def _between(photo: ScenePhoto, taken: Tensor, spaces: Sequence[_FreeSpace]) -> Seeds:
+    """Seeds in the gaps that a photo shows, at the depth of positions [P, 3] around."""
     gaps = _gaps(photo, taken, photo.shown[..., 0])
-    seen = visible(points, [photo.view], photo.reduction, photo.size)
+    seen = visible(taken, [photo.view], photo.reduction, photo.size)
     if not len(gaps) or len(seen.pixel) < NEIGHBORS:
-        return Seeds.none(points)
+        return Seeds.none(taken)
     width = photo.size[1]
     depth = _depth(gaps, torch.stack([seen.pixel // width, seen.pixel % width], dim=-1), seen.depth)
-    camera, rays = _rays(photo, gaps, points)
+    camera, rays = _rays(photo, gaps, taken)
     color = photo.color[tuple(gaps.to(photo.color.device).mT)]
-    seeds = Seeds(camera + depth[:, None] * rays, color.to(points), _width(photo) * depth)
+    seeds = Seeds(camera + depth[:, None] * rays, color.to(taken), _width(photo) * depth)
     return seeds.subset(~_hide_points(seeds.positions, spaces))
 
 
-def _behind(photo: ScenePhoto, points: Tensor, taken: Tensor, spaces: Sequence[_FreeSpace], far: Sphere) -> Seeds:
+def _behind(photo: ScenePhoto, taken: Tensor, far: Sphere) -> Seeds:
     """Seeds far away in the gaps that a photo hides."""
     gaps, shown = _gaps(photo, taken, ~photo.shown[..., 0]), _on_grid(photo.shown[..., 0]).nonzero()
     if not len(gaps) or len(shown) < NEIGHBORS:
-        return Seeds.none(points)
+        return Seeds.none(taken)
     around = shown[_nearest(gaps.to(shown.device), shown)]
     color = photo.color[around[..., 0], around[..., 1]].mean(dim=1)
-    camera, rays = _rays(photo, gaps, points)
+    camera, rays = _rays(photo, gaps, taken)
     depth = far.depths(camera, rays)
-    return Seeds(camera + depth[:, None] * rays, color.to(points), _width(photo) * depth)
+    return Seeds(camera + depth[:, None] * rays, color.to(taken), _width(photo) * depth)
 
 
 def _gaps(photo: ScenePhoto, taken: Tensor, where: Tensor) -> Tensor:
@@ -173,8 +173,7 @@ def _nearest(gaps: Tensor, places: Tensor) -> Tensor:
 def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
     """Depths [G] at pixels [G, 2], of planes through the NEIGHBORS nearest of pixels [M, 2] with depths [M].
 
-    The inverse depth of a plane is linear in the frame. It stays between those of the neighbors, of which the nearest
-    and the farthest may be wrong matches.
+    The inverse depth of a plane is linear in the frame. It is not extrapolated beyond that of the neighbors.
     """
     nearest = _nearest(gaps, places)
     inverse = 1 / depths[nearest]
@@ -186,5 +185,4 @@ def _depth(gaps: Tensor, places: Tensor, depths: Tensor) -> Tensor:
     flat = FLATNESS * (middle.square().sum(dim=-1) + (xx + yy) / NEIGHBORS)
     xx, yy = xx + flat, yy + flat
     slope = torch.stack([yy * x - xy * y, xx * y - xy * x], dim=-1) / (xx * yy - xy * xy)[:, None]
-    ordered = inverse.sort(dim=1).values
-    return 1 / (mean - (slope * middle).sum(dim=-1)).clamp(ordered[:, 1], ordered[:, -2])
+    return 1 / (mean - (slope * middle).sum(dim=-1)).clamp(inverse.amin(dim=1), inverse.amax(dim=1))
