@@ -15,10 +15,10 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.distant_points import Sphere
+from ssa_nerfstudio.evidence.nearest_depths import nearest_depths
 from ssa_nerfstudio.evidence.point_samples import (
     OCCLUSION_TOLERANCE,
     View,
-    nearest_depths,
     project,
     regular_subset,
     visible,

@@ -10,14 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence import brightness
+from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS, nearest_depths
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE, GRAY_LEVEL, UNKNOWN_DEVIATION
 
 WORKING_SIZE = brightness.WORKING_SIZE // 2
 """Photos are reduced by the integer that brings their longer side nearest to this, pixels: half of detection's."""
 OCCLUSION_TOLERANCE = 0.05
 """A point is hidden where another one within OCCLUSION_RADIUS is nearer by more than this share of its depth."""
-OCCLUSION_RADIUS = 2
-"""Working pixels."""
 MAX_PROJECTIONS = 5_000_000
 """Points times views; of more points a regular subset is projected, whose samples are dense enough."""
 VIEWS_AT_ONCE = 64
@@ -296,17 +295,3 @@ def visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[i
         seen = (depth <= nearest[view, pixel] * (1 + OCCLUSION_TOLERANCE)).nonzero()[:, 0]
         found.append([each[seen] for each in (view + first, point, pixel, position, depth)])
     return Sights(*(torch.cat(each) for each in zip(*found, strict=True)))
-
-
-def nearest_depths(view: Tensor, pixel: Tensor, depth: Tensor, size: tuple[int, int, int]) -> Tensor:
-    """Least depth within OCCLUSION_RADIUS of each working pixel, [V, h w]; infinite where there is none.
-
-    Args:
-        view, pixel, depth: of M points in views, [M] each.
-        size: number of views, height and width of the working frame.
-    """
-    views, height, width = size
-    nearest = torch.full((views * height * width,), torch.inf, device=depth.device, dtype=depth.dtype)
-    nearest = nearest.scatter_reduce(0, view * (height * width) + pixel, depth, "amin").reshape(-1, height, width)
-    side = 2 * OCCLUSION_RADIUS + 1
-    return -nn.functional.max_pool2d(-nearest, side, stride=1, padding=OCCLUSION_RADIUS).flatten(1)

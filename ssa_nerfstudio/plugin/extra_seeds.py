@@ -31,6 +31,19 @@ class ExtraSeeds:
     backdrop: Seeds
     """Far away, where the artifact or a mask hides the scene: for the end of the training."""
 
+    def described(self) -> list[tuple[Seeds, str]]:
+        """Those to start from, if there are any, and what a user is told of them."""
+        kinds = (
+            (
+                self.distant,
+                "far away, where the photos show a sky or the like and the dataset has no points",
+                "distant",
+            ),
+            (self.gaps, "in gaps between the dataset's points, at the depth of those around", "gap"),
+        )
+        text = "More Gaussians to start from: {:,} {}. (--pipeline.model.{}-seeds False leaves them out.)"
+        return [(seeds, text.format(len(seeds), where, name)) for seeds, where, name in kinds if len(seeds)]
+
 
 @torch.no_grad()
 def find_extra_seeds(

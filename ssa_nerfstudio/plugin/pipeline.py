@@ -120,20 +120,9 @@ class SSAPipeline(VanillaPipeline):
         found = find_extra_seeds(model.config, model.artifacts, photos, cameras, self._points(), model.exposure)
         if found is None:
             return
-        for seeds, where, setting in (
-            (
-                found.distant,
-                "far away, where the photos show a sky or the like and the dataset has no points",
-                "distant",
-            ),
-            (found.gaps, "in gaps between the dataset's points, at the depth of those around", "gap"),
-        ):
+        for seeds, text in found.described():
             add_seeds(seeds, model.gauss_params, model.config.sh_degree)
-            if len(seeds):
-                tell(
-                    f"More Gaussians to start from: {len(seeds):,} {where}. (--pipeline.model.{setting}-seeds False "
-                    "leaves them out.)"
-                )
+            tell(text)
         model.artifacts.backdrop = found.backdrop.table().to(model.device)
 
     def _set_budget(self) -> None:
