@@ -36,7 +36,7 @@ class ExtraSeeds:
         kinds = (
             (
                 self.distant,
-                "far away, where the photos show a sky or the like and the dataset has no points",
+                "far away, where photos show a sky or the like and the dataset has no points",
                 "distant",
             ),
             (self.gaps, "in gaps between the dataset's points, at the depth of those around", "gap"),
