@@ -16,8 +16,7 @@ from record_game import TALL, UNIT
 
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.distant_points import distant_points, horizon
-from ssa_nerfstudio.evidence.gap_points import MAX_VIEWS, SPACING, gap_points
+from ssa_nerfstudio.evidence.gap_points import SPACING, photos_to_fill
 from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, pixels_of
 
 STRETCH = UNIT * np.array([1, 1, TALL])
@@ -71,7 +70,7 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
     """Of each distant seed the share of the photos in which it is in the sky; of each gap seed its depth relative to
     the true one in the photo that it fills, 0 in the sky."""
     from ssa_nerfstudio.experiments.runs.run_configuration import configure
-    from ssa_nerfstudio.plugin.extra_seeds import photos_of_scene
+    from ssa_nerfstudio.plugin.extra_seeds import photos_of_scene, seeds_between
 
     config = configure("ssa-splatfacto", path, Path("outputs"), 1)
     model = config.pipeline.model
@@ -83,24 +82,22 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
 
     def trace(photo: ScenePhoto, positions: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
         """Distances of positions from the camera, relative to the surface behind, and whether there is one."""
-        pose = photo.view.world_to_camera.double().numpy()
-        camera = -pose[:3, :3].T @ pose[:3, 3]
+        camera = photo.view.position.double().numpy()
         origin = np.linalg.solve(transform[:, :3], camera / scale - transform[:, 3]) / STRETCH
         rays = np.linalg.solve(transform[:, :3], (positions.double().numpy() - camera).T / scale).T / STRETCH
         depth, solid = world.trace(origin, rays)
         return 1 / depth, solid
 
-    points = outputs.metadata["points3D_xyz"]
-    distant = distant_points(points, photos)
+    seeds = seeds_between(outputs.metadata["points3D_xyz"], photos)
+    distant, gaps = seeds.distant, seeds.gaps
     seen, sky = np.zeros(len(distant)), np.zeros(len(distant))
     for photo in photos:
         index = pixels_of(distant.positions, photo)[0]
         if len(index):
             seen[index.numpy()] += 1
             sky[index.numpy()] += ~trace(photo, distant.positions[index])[1]
-    gaps = gap_points(torch.cat([points, distant.positions]), photos, horizon(points, photos))[0]
     ratios = np.full(len(gaps), np.nan)
-    for photo in photos[:: -(-len(photos) // MAX_VIEWS)]:
+    for photo in photos_to_fill(photos):
         # A seed is as wide as SPACING working pixels of the photo that it fills.
         pose, index = photo.view.world_to_camera.to(gaps.positions), pixels_of(gaps.positions, photo)[0]
         depth = (gaps.positions[index] @ pose[:3, :3].T + pose[:3, 3])[:, 2]

@@ -25,8 +25,6 @@ from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.detection import Detection, detect
-from ssa_nerfstudio.evidence.distant_points import distant_points, horizon
-from ssa_nerfstudio.evidence.gap_points import gap_points
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
@@ -35,6 +33,7 @@ from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.plugin.extra_seeds import seeds_between
 
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
@@ -170,9 +169,9 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             detection, found, layers = own = own or start(False)
             with _scaled(constant, factor):
                 photos = scene_photos(views, [layers] * len(views), [0] * len(views))
-                distant, far = distant_points(points, photos), horizon(points, photos)
-                gaps, hidden = gap_points(torch.cat([points, distant.positions]), photos, far)
-            seeds = {"seeds": len(distant), "gaps": len(gaps), "backdrop": len(hidden)}
+                found_seeds = seeds_between(points, photos)
+            counted = found_seeds.distant, found_seeds.gaps, found_seeds.backdrop
+            seeds = {name: len(each) for name, each in zip(("seeds", "gaps", "backdrop"), counted, strict=True)}
         else:
             with _scaled(constant, factor):
                 detection, found, layers = start(module in DETECTION)

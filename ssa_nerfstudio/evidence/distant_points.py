@@ -19,12 +19,8 @@ from scipy.spatial import KDTree
 from scipy.special import stdtrit
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.point_samples import (
-    OCCLUSION_RADIUS,
-    order_by_point,
-    regular_subset,
-    summed,
-)
+from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
+from ssa_nerfstudio.evidence.point_samples import order_by_point, regular_subset, summed
 from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, near_points, pixels_of
 from ssa_nerfstudio.evidence.seeds import Seeds
 
@@ -53,7 +49,7 @@ _Place = TypeVar("_Place", int, Tensor)
 
 
 @torch.no_grad()
-def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
+def distant_points(points: Tensor, photos: Sequence[ScenePhoto], sphere: Sphere) -> Seeds:
     """Find directions in which the photos show something far away, and no point is seen.
 
     A direction is a candidate if half of the views that show it see none of the scene's points around it. If it is far
@@ -67,14 +63,14 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
         photos: at least one.
+        sphere: where they are, `horizon`.
 
     Returns:
         The seeds, on the device of the scene's points; there may be none.
     """
     points = regular_subset(points, len(photos))
-    cameras, sphere = _cameras(photos).to(points), horizon(points, photos)
     center, radius = sphere.center, sphere.radius
-    baseline = float((cameras - center).norm(dim=1).max())
+    baseline = float((_cameras(photos).to(points) - center).norm(dim=1).max())
     nearer = [_distance(points, center, share) for share in NEARER]
     angles = [photo.reduction / float(photo.view.intrinsics[0, 0]) for photo in photos]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
@@ -82,19 +78,17 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto]) -> Seeds:
     taken = [near_points(points, photo, OCCLUSION_RADIUS).flatten() for photo in photos]
     frames = list(zip(photos, taken, _still_pictures(photos), strict=True))
     far = _sights(center + radius * directions, frames)
-    shown = far.shown >= MIN_SIGHTS
-    likely = shown & (far.counted >= MIN_SIGHTS) & (2 * far.counted >= far.shown)
+    likely = (far.counted >= MIN_SIGHTS) & (2 * far.counted >= far.shown)
     candidates = likely.nonzero()[:, 0]
     if not len(candidates):
         return Seeds.none(points)
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
-    cost, still = far.cost[candidates], far.still[candidates]
-    alternatives = [_sights(center + at * directions[candidates], frames).cost for at in nearer]
+    cost, still = far.cost()[candidates], far.still_cost()[candidates]
+    alternatives = [_sights(center + at * directions[candidates], frames).cost() for at in nearer]
     distant = _distant(directions[candidates], angle, cost - still, [cost - other for other in alternatives])
-    found = torch.zeros_like(shown)
-    found[candidates[distant]] = True
+    found = candidates[distant]
     positions = center + radius * directions[found]
-    return Seeds(positions, far.median[found], positions.new_full((len(positions),), radius * angle))
+    return Seeds(positions, far.median()[found], positions.new_full((len(positions),), radius * angle))
 
 
 @dataclass(frozen=True)
@@ -124,8 +118,7 @@ def horizon(points: Tensor, photos: Sequence[ScenePhoto]) -> Sphere:
 
 def _cameras(photos: Sequence[ScenePhoto]) -> Tensor:
     """Positions [V, 3]."""
-    poses = torch.stack([photo.view.world_to_camera for photo in photos])
-    return -(poses[:, :3, :3].mT @ poses[:, :3, 3:])[..., 0]
+    return torch.stack([photo.view.position for photo in photos])
 
 
 def _distance(points: Tensor, center: Tensor, share: float) -> float:
@@ -135,23 +128,59 @@ def _distance(points: Tensor, center: Tensor, share: float) -> float:
 
 @dataclass(frozen=True)
 class _Sights:
-    """What V views show of N positions, and how well another view explains it: a difference d costs d / (d + NOISE).
+    """What V views show of N positions: M pairs of a position and a view that counts, position by position.
 
-    Of n views the other one is n / 3 further, so that each is compared with two. The median of all would be less noisy
-    the more there are, and of two distances the one that is in more frames would seem better.
-    Costs are NaN where a position does not count: not in the frame, hidden, or near one of the scene's points.
+    A view does not count where the position is not in the frame, hidden, or near one of the scene's points.
     """
 
-    median: Tensor
-    """Of the colors that count, the one of median brightness, [N, 3]."""
-    cost: Tensor
-    """[N, V], of the color there in another view; NaN for all views if fewer than MIN_SIGHTS count."""
+    index: Tensor
+    """[M] int64: of the position."""
+    view: Tensor
+    """[M] int64, ascending for each position."""
+    color: Tensor
+    """[M, 3]."""
     still: Tensor
-    """[N, V], of another view's color at the same pixel; NaN also where that shows nothing."""
+    """[M, 3]: another view's color at the same pixel; NaN where that shows nothing."""
     counted: Tensor
     """[N] int64: views that count."""
     shown: Tensor
     """[N] int64: views that show a position, near points or not."""
+    views: int
+    """V."""
+
+    def cost(self) -> Tensor:
+        """[N, V], of the color there in another view; NaN for all views if fewer than MIN_SIGHTS count.
+
+        Of n views the other one is n / 3 further, so that each is compared with two. The median of all would be less
+        noisy the more there are, and of two distances the one that is in more frames would seem better.
+        """
+        place = torch.arange(len(self.index), device=self.index.device) - self._first()[self.index]
+        other = self._first()[self.index] + _another(place, self.counted[self.index])
+        cost = self._cost_beside(self.color[other])
+        cost[self.counted < MIN_SIGHTS] = torch.nan
+        return cost
+
+    def still_cost(self) -> Tensor:
+        """[N, V], of what stands still in the frame; NaN also where the other view shows nothing."""
+        return self._cost_beside(self.still)
+
+    def median(self) -> Tensor:
+        """Of the colors that count, the one of median brightness, [N, 3]; black where none does."""
+        median, any_counts = self.color.new_zeros(len(self.counted), 3), self.counted > 0
+        middle = (self._first() + self.counted // 2)[any_counts]
+        median[any_counts] = self.color[order_by_point(self.index, self.color)][middle]
+        return median
+
+    def _first(self) -> Tensor:
+        """[N]: where each position's pairs begin."""
+        return self.counted.cumsum(0) - self.counted
+
+    def _cost_beside(self, reference: Tensor) -> Tensor:
+        """[N, V]: a difference d from colors [M, 3] costs d / (d + NOISE); NaN where a view does not count."""
+        cost = self.color.new_full((len(self.counted), self.views), torch.nan)
+        difference = (self.color - reference).abs().mean(dim=-1)
+        cost[self.index, self.view] = difference / (difference + NOISE)
+        return cost
 
 
 def _distant(directions: Tensor, angle: float, beside_still: Tensor, beside_nearer: Sequence[Tensor]) -> Tensor:
@@ -260,14 +289,4 @@ def _sights(positions: Tensor, frames: Sequence[tuple[ScenePhoto, Tensor, Tensor
     in_views = counts[torch.argsort(index[counts], stable=True)]
     index, view, color, still = index[in_views], view[in_views], color[in_views], still[in_views]
     counted = torch.bincount(index, minlength=count)
-    first = counted.cumsum(0) - counted
-    median = color.new_zeros(count, 3)
-    median[counted > 0] = color[order_by_point(index, color)][(first + counted // 2)[counted > 0]]
-    place = torch.arange(len(index), device=index.device) - first[index]
-    other = first[index] + _another(place, counted[index])
-    costs = color.new_full((2, count, len(frames)), torch.nan)
-    for cost, reference in zip(costs, (color[other], still), strict=True):
-        difference = (color - reference).abs().mean(dim=-1)
-        cost[index, view] = difference / (difference + NOISE)
-    costs[0, counted < MIN_SIGHTS] = torch.nan
-    return _Sights(median, costs[0], costs[1], counted, shown)
+    return _Sights(index, view, color, still, counted, shown, len(frames))

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
-from ssa_nerfstudio.evidence.point_samples import OCCLUSION_RADIUS, PointSamples, summed
+from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
+from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.static_area import MAX_OPAQUE_DEVIATION, MIN_AREA, connected_parts, low_deviation
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 

@@ -58,10 +58,10 @@ def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tup
         The seeds that photos show, and those that they hide, on the device of the points; there may be none.
     """
     points = regular_subset(points, MAX_VIEWS)
-    photos = photos[:: -(-len(photos) // MAX_VIEWS)]
+    photos = photos_to_fill(photos)
     taken, found = points, []
     for part in (partial(_between, spaces=_free_spaces(points, photos)), partial(_behind, far=far)):
-        seeds = [Seeds.none(points)]
+        seeds = []
         for photo in photos:
             seeds.append(part(photo, taken))
             taken = torch.cat([taken, seeds[-1].positions])
@@ -69,11 +69,18 @@ def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tup
     return found[0], found[1]
 
 
+def photos_to_fill(photos: Sequence[ScenePhoto]) -> Sequence[ScenePhoto]:
+    """Those whose gaps are filled: a regular subset of at most MAX_VIEWS."""
+    return photos[:: -(-len(photos) // MAX_VIEWS)]
+
+
 def _between(photo: ScenePhoto, taken: Tensor, spaces: Sequence[_FreeSpace]) -> Seeds:
     """Seeds in the gaps that a photo shows, at the depth of positions [P, 3] around."""
     gaps = _gaps(photo, taken, photo.shown[..., 0])
+    if not len(gaps):
+        return Seeds.none(taken)
     seen = visible(taken, [photo.view], photo.reduction, photo.size)
-    if not len(gaps) or len(seen.pixel) < NEIGHBORS:
+    if len(seen.pixel) < NEIGHBORS:
         return Seeds.none(taken)
     width = photo.size[1]
     depth = _depth(gaps, torch.stack([seen.pixel // width, seen.pixel % width], dim=-1), seen.depth)
@@ -113,8 +120,8 @@ def _rays(photo: ScenePhoto, pixels: Tensor, like: Tensor) -> tuple[Tensor, Tens
     # On the host: on a GPU the inverse would load a library for it.
     inverse = torch.linalg.inv(photo.view.intrinsics.cpu()).to(like)
     place = torch.cat([(pixels.flip(-1) + 0.5) * photo.reduction, torch.ones_like(pixels[:, :1])], dim=-1)
-    pose = photo.view.world_to_camera.to(like)
-    return -pose[:3, 3] @ pose[:3, :3], place.to(like) @ inverse.mT @ pose[:3, :3]
+    rotation = photo.view.world_to_camera[:3, :3].to(like)
+    return photo.view.position.to(like), place.to(like) @ inverse.mT @ rotation
 
 
 def _width(photo: ScenePhoto) -> float:

@@ -16,7 +16,8 @@ from ssa_nerfstudio._system.in_place_graphs import repeat
 from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
-from ssa_nerfstudio.evidence.point_samples import OCCLUSION_RADIUS, PointSamples, summed
+from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
+from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 

@@ -42,6 +42,11 @@ class View:
     gain: Tensor | None = None
     """[3], per channel: colors are divided by it, which brings photos to one exposure; None: they stay as they are."""
 
+    @property
+    def position(self) -> Tensor:
+        """Of the camera, [3], world units."""
+        return -self.world_to_camera[:3, 3] @ self.world_to_camera[:3, :3]
+
 
 @dataclass(frozen=True)
 class PointSamples:
@@ -137,8 +142,7 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
         own = slice(ends[first], ends[first + len(some)])
         view, pixel, position, side = seen.view[own] - first, seen.pixel[own], seen.position[own], footprint[own]
         images = torch.stack([each.image[..., :3].to(points.device).float() for each in some])
-        unmasked = None
-        inside = torch.ones_like(pixel, dtype=torch.bool)
+        unmasked, inside = None, torch.ones_like(pixel, dtype=torch.bool)
         if any(each.mask is not None for each in some):
             everywhere = torch.ones(height, width)
             masks = [everywhere if each.mask is None else each.mask.reshape(height, width) != 0 for each in some]
@@ -232,8 +236,7 @@ def _matched(color: Tensor, here: Tensor, there: Tensor) -> Tensor:
 
 
 def _boxes(images: Tensor, side: int) -> Tensor:
-    """Means [..., H - side + 1, W - side + 1, C] of images [..., H, W, C] over all squares of this side, in their own
-    units."""
+    """Means [..., H - side + 1, W - side + 1, C] of images [..., H, W, C] over all squares of this side."""
     means = images.float()
     for dim in (-3, -2):
         length = means.shape[dim] - side + 1
@@ -262,8 +265,7 @@ def _read(boxes: Tensor, view: Tensor, position: Tensor, side: int) -> Tensor:
 
 
 def _patch_means(images: Tensor, view: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
-    """Means [M, C] of images [V, h, w, C] of views [M] over squares around pixels [M], of these sides [M], cut off at
-    the frame."""
+    """Means [M, C] of images [V, h, w, C] of views [M] over squares of sides [M] around pixels [M], in the frame."""
     height, width = images.shape[1:3]
     sums = nn.functional.pad(images.double().cumsum(1).cumsum(2), (0, 0, 1, 0, 1, 0))
     place = torch.stack([pixel % width, pixel // width], dim=-1)

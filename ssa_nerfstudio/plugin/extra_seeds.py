@@ -17,7 +17,6 @@ from ssa_nerfstudio.plugin.camera_matching import group_cameras
 from ssa_nerfstudio.plugin.exposure import Exposure
 from ssa_nerfstudio.plugin.overlay_setup import views_of
 from ssa_nerfstudio.plugin.settings import ModelSettings
-from ssa_nerfstudio.plugin.training.seed_points import outside_cameras
 
 
 @dataclass(frozen=True)
@@ -33,14 +32,9 @@ class ExtraSeeds:
 
     def described(self) -> list[tuple[Seeds, str]]:
         """Those to start from, if there are any, and what a user is told of them."""
-        kinds = (
-            (
-                self.distant,
-                "far away, where photos show a sky or the like and the dataset has no points",
-                "distant",
-            ),
-            (self.gaps, "in gaps between the dataset's points, at the depth of those around", "gap"),
-        )
+        sky = "far away, where photos show a sky or the like and the dataset has no points"
+        gaps = "in gaps between the dataset's points, at the depth of those around"
+        kinds = (self.distant, sky, "distant"), (self.gaps, gaps, "gap")
         text = "More Gaussians to start from: {:,} {}. (--pipeline.model.{}-seeds False leaves them out.)"
         return [(seeds, text.format(len(seeds), where, name)) for seeds, where, name in kinds if len(seeds)]
 
@@ -61,7 +55,7 @@ def find_extra_seeds(
         artifacts: the overlays, assigned to the photos.
         photos: the datamanager's undistorted cache.
         cameras: of the photos.
-        points: of the scene [N, 3], from structure from motion; None where there are none.
+        points: of the scene [N, 3], from structure from motion, outside all cameras; None where there are none.
         exposure: of the photos, where it is learned.
 
     Returns:
@@ -72,12 +66,26 @@ def find_extra_seeds(
         return None
     of_scene = photos_of_scene(artifacts, photos, cameras, exposure)
     points = points.to(of_scene[0].color.device)
-    points = points[outside_cameras(points, cameras.camera_to_worlds[:, :3, 3])]
-    nothing = Seeds.none(points)
-    distant = distant_points(points, of_scene) if config.distant_seeds else nothing
-    known = torch.cat([points, distant.positions])
-    gaps, backdrop = gap_points(known, of_scene, horizon(points, of_scene)) if config.gap_seeds else (nothing, nothing)
-    return ExtraSeeds(distant, gaps, backdrop)
+    return seeds_between(points, of_scene, config.distant_seeds, config.gap_seeds)
+
+
+def seeds_between(
+    points: torch.Tensor, photos: list[ScenePhoto], distant: bool = True, gaps: bool = True
+) -> ExtraSeeds:
+    """Those of one or both kinds.
+
+    Args:
+        points: of the scene [N, 3], world units, finite; at least one.
+        photos: at least one.
+        distant: look for distant ones.
+        gaps: fill gaps, and what is hidden.
+    """
+    sphere, nothing = horizon(points, photos), Seeds.none(points)
+    far = distant_points(points, photos, sphere) if distant else nothing
+    between, hidden = nothing, nothing
+    if gaps:
+        between, hidden = gap_points(torch.cat([points, far.positions]), photos, sphere)
+    return ExtraSeeds(far, between, hidden)
 
 
 @torch.no_grad()

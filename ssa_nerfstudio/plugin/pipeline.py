@@ -117,7 +117,9 @@ class SSAPipeline(VanillaPipeline):
         model, cameras = self.model, self.datamanager.train_dataset.cameras
         if self.config.artifacts_of:
             return  # a resumed run has its checkpoint's
-        found = find_extra_seeds(model.config, model.artifacts, photos, cameras, self._points(), model.exposure)
+        # start_outside_cameras has left out those beside cameras.
+        points = None if self._points() is None else model.means.data
+        found = find_extra_seeds(model.config, model.artifacts, photos, cameras, points, model.exposure)
         if found is None:
             return
         for seeds, text in found.described():

@@ -16,6 +16,7 @@ from ssa_nerfstudio.evidence.distant_points import (
     _distant,
     _significance,
     distant_points,
+    horizon,
 )
 from ssa_nerfstudio.evidence.point_samples import View
 from ssa_nerfstudio.evidence.scene_photos import scene_photos
@@ -60,7 +61,8 @@ def turning_views(artifact: tuple[Tensor, Tensor] | None = None, still: bool = F
 
 def distant(points: Tensor, *photos: Any) -> Seeds:
     """`distant_points` of photos, of which views, layers and groups are given."""
-    return distant_points(points, scene_photos(*photos))
+    of_scene = scene_photos(*photos)
+    return distant_points(points, of_scene, horizon(points, of_scene))
 
 
 def errors(found: Seeds) -> Tensor:
