@@ -33,7 +33,6 @@ from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
-from ssa_nerfstudio.plugin.extra_seeds import seeds_between
 
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
@@ -137,6 +136,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
     from ssa_nerfstudio.experiments.runs.run_configuration import configure
+    from ssa_nerfstudio.plugin.extra_seeds import seeds_between
     from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
     config = configure("ssa-splatfacto", path, Path("outputs"), 1)
