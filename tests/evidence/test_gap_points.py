@@ -129,11 +129,11 @@ def test_what_a_photo_hides_others_fill_or_a_backdrop_continues(by: str) -> None
     assert not len(hidden), "the other photo shows it"
 
 
-def test_a_wrong_match_in_a_gap_reaches_no_farther_than_the_seeds_beside_it() -> None:
+def test_a_wrong_match_in_a_gap_spoils_few_seeds() -> None:
     stray = torch.tensor([[0.1, 0.0, 1.0]])
     views = [wall_view(pose()), wall_view(pose(right=0.7)), wall_view(pose(right=-0.7))]
     seeds = gaps(torch.cat([wall_points(), stray]), views)
-    assert ((seeds.positions[:, 2] - AT).abs() < 0.01).float().mean() > 0.8
+    assert ((seeds.positions[:, 2] - AT).abs() < 0.01).float().mean() > 0.95
 
 
 def test_large_photos_are_filled_as_small_ones() -> None:
@@ -156,11 +156,12 @@ def test_large_photos_are_filled_as_small_ones() -> None:
     assert (checked < 0.8 * AT).sum() < 0.7 * (alone < 0.8 * AT).sum()
 
 
-def test_a_seed_that_hides_what_another_photo_sees_is_left_out() -> None:
-    """Beside a post the neighbors are on it, in front of a wall whose points another photo sees there."""
+@pytest.mark.parametrize(("gap", "right"), [(0.5, -1.0), (1.0, 1.0)], ids=["points", "plain"])
+def test_a_seed_that_hides_what_another_photo_sees_is_left_out(gap: float, right: float) -> None:
+    """Beside a post the neighbors are on it, in front of a wall that another photo sees there."""
     post = torch.cartesian_prod(torch.linspace(-0.22, -0.16, 8), torch.linspace(-1, 1, 80), torch.tensor([AT / 2]))
-    points = torch.cat([wall_points(gap=0.5), post])
-    alone, checked = (gaps(points, [wall_view(pose()), *others]) for others in ([], [wall_view(pose(right=-1.0))]))
+    points = torch.cat([wall_points(gap), post])
+    alone, checked = (gaps(points, [wall_view(pose()), *others]) for others in ([], [wall_view(pose(right))]))
     alone_near, checked_near = (int((seeds.positions[:, 2] < 0.8 * AT).sum()) for seeds in (alone, checked))
     assert alone_near > 5
     assert checked_near < 0.3 * alone_near
