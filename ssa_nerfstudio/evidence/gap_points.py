@@ -18,6 +18,7 @@ from ssa_nerfstudio.evidence.distant_points import Sphere
 from ssa_nerfstudio.evidence.nearest_depths import nearest_depths
 from ssa_nerfstudio.evidence.point_samples import (
     OCCLUSION_TOLERANCE,
+    View,
     project,
     regular_subset,
     visible,
@@ -33,7 +34,7 @@ NEIGHBORS = 8
 FLATNESS = 0.1
 """Weight of a constant depth beside that plane's slope: neighbors on one line say nothing about the other direction."""
 CLEAR_BY = 2 * OCCLUSION_TOLERANCE
-"""A seed hides what a photo shows if all around it there is farther by more than this share of the seed's depth."""
+"""A seed hides points of a photo if all those around it are farther by more than this share of its depth."""
 MAX_VIEWS = 32
 """Photos whose gaps are filled: neighboring ones show the same."""
 
@@ -42,11 +43,11 @@ MAX_VIEWS = 32
 def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tuple[Seeds, Seeds]:
     """Fill the frames between points, at their depth, photo by photo, with the seeds of those before as further points.
 
-    A seed that hides what another photo shows, points or gaps between them, is at a wrong depth, as beside the outline
-    of something near, and is left out.
+    A seed that hides points in the frame of another photo is at a wrong depth, as beside the outline of something near,
+    and is left out.
 
-    Then what a photo hides, because of an artifact or a mask, where there are neither points nor seeds: probably no
-    photo shows it. It continues the colors around, behind everything, because splats that photos show may be there.
+    Then what a photo hides, because of an opaque artifact or a mask, where there are neither points nor seeds: probably
+    no photo shows it. It continues the colors around, behind everything, because splats that photos show may be there.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.
@@ -75,16 +76,23 @@ def photos_to_fill(photos: Sequence[ScenePhoto]) -> Sequence[ScenePhoto]:
 
 def _between(photo: ScenePhoto, taken: Tensor, spaces: Sequence[_FreeSpace]) -> Seeds:
     """Seeds in the gaps that a photo shows, at the depth of positions [P, 3] around."""
-    gaps, depth = _shown_gaps(photo, taken)
+    gaps = _gaps(photo, taken, photo.shown[..., 0])
+    if not len(gaps):
+        return Seeds.none(taken)
+    seen = visible(taken, [photo.view], photo.reduction, photo.size)
+    if len(seen.pixel) < NEIGHBORS:
+        return Seeds.none(taken)
+    width = photo.size[1]
+    depth = _depth(gaps, torch.stack([seen.pixel // width, seen.pixel % width], dim=-1), seen.depth)
     camera, rays = _rays(photo, gaps, taken)
     color = photo.color[tuple(gaps.to(photo.color.device).mT)]
     seeds = Seeds(camera + depth[:, None] * rays, color.to(taken), _width(photo) * depth)
-    return seeds.subset(~_hide(seeds.positions, spaces))
+    return seeds.subset(~_hide_points(seeds.positions, spaces))
 
 
 def _behind(photo: ScenePhoto, taken: Tensor, far: Sphere) -> Seeds:
     """Seeds far away in the gaps that a photo hides."""
-    gaps, shown = _gaps(photo, taken, ~photo.shown[..., 0]), _on_grid(photo.shown[..., 0]).nonzero()
+    gaps, shown = _gaps(photo, taken, photo.hidden[..., 0]), _on_grid(photo.shown[..., 0]).nonzero()
     if not len(gaps) or len(shown) < NEIGHBORS:
         return Seeds.none(taken)
     around = shown[_nearest(gaps.to(shown.device), shown)]
@@ -92,16 +100,6 @@ def _behind(photo: ScenePhoto, taken: Tensor, far: Sphere) -> Seeds:
     camera, rays = _rays(photo, gaps, taken)
     depth = far.depths(camera, rays)
     return Seeds(camera + depth[:, None] * rays, color.to(taken), _width(photo) * depth)
-
-
-def _shown_gaps(photo: ScenePhoto, taken: Tensor) -> tuple[Tensor, Tensor]:
-    """Row and column [G, 2] of the gaps that a photo shows, and their depths [G] from those of positions [P, 3] around;
-    none where too few are visible."""
-    gaps, seen = _gaps(photo, taken, photo.shown[..., 0]), visible(taken, [photo.view], photo.reduction, photo.size)
-    if not len(gaps) or len(seen.pixel) < NEIGHBORS:
-        return gaps[:0], taken[:0, 0]
-    places = torch.stack([seen.pixel // photo.size[1], seen.pixel % photo.size[1]], dim=-1)
-    return gaps, _depth(gaps, places, seen.depth)
 
 
 def _gaps(photo: ScenePhoto, taken: Tensor, where: Tensor) -> Tensor:
@@ -144,35 +142,26 @@ class _FreeSpace:
     reduction: int
     """Photo pixels a working pixel."""
     depths: Tensor
-    """[V, h w], to the nearest point or gap around each working pixel; infinite where there is none."""
+    """[V, h w], to the nearest point around each working pixel; infinite where there is none."""
 
 
 def _free_spaces(points: Tensor, photos: Sequence[ScenePhoto]) -> list[_FreeSpace]:
-    """Of photos of each size, to points [P, 3] and to the gaps between them, at the depth of those around.
-
-    Gaps count, because a photo of a plain wall has no points that contradict a seed right before its camera.
-    """
-    alike: dict[tuple[tuple[int, int], int], list[ScenePhoto]] = {}
+    """Of photos of each size."""
+    alike: dict[tuple[tuple[int, int], int], list[View]] = {}
     for photo in photos:
-        alike.setdefault((photo.size, photo.reduction), []).append(photo)
+        alike.setdefault((photo.size, photo.reduction), []).append(photo.view)
     spaces = []
-    for (size, reduction), some in alike.items():
-        poses = torch.stack([photo.view.world_to_camera for photo in some])
-        lenses = torch.stack([photo.view.intrinsics for photo in some])
+    for (size, reduction), views in alike.items():
+        poses = torch.stack([view.world_to_camera for view in views])
+        lenses = torch.stack([view.intrinsics for view in views])
         camera, _, position, depth = project(points, poses, lenses, size[0] * reduction, size[1] * reduction)
-        of_points = camera, working_pixels(position, size, reduction), depth
-        of_gaps = []
-        for number, photo in enumerate(some):
-            gaps, between = _shown_gaps(photo, points)
-            of_gaps.append((torch.full_like(gaps[:, 0], number), gaps[:, 0] * size[1] + gaps[:, 1], between))
-        camera, pixel, depth = (torch.cat(each) for each in zip(of_points, *of_gaps, strict=True))
-        depths = nearest_depths(camera, pixel, depth, (len(some), *size))
+        depths = nearest_depths(camera, working_pixels(position, size, reduction), depth, (len(views), *size))
         spaces.append(_FreeSpace(poses, lenses, size, reduction, depths))
     return spaces
 
 
-def _hide(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
-    """[N] bool: whether a position [N, 3] is before all that is around it in the frame of one of the photos."""
+def _hide_points(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
+    """[N] bool: whether a position [N, 3] is before all points around it in the frame of one of the photos."""
     hide = torch.zeros_like(positions[:, 0], dtype=torch.bool)
     for space in spaces:
         size = space.size[0] * space.reduction, space.size[1] * space.reduction

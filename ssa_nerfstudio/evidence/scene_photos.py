@@ -16,6 +16,8 @@ MAX_VIEWS = 128
 """Views that are read; of more a regular subset, group by group."""
 MIN_SHOWN = 0.5
 """Transmittance of the artifact below which a pixel does not count."""
+MAX_HIDDEN = 0.1
+"""Transmittance below which a pixel says nothing of the scene: what it says is in proportion to the square."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class ScenePhoto:
     color: Tensor
     """[h, w, 3] in [0, 1], working pixels."""
     shown: Tensor
-    """[h, w, 1] bool: no mask and no opaque artifact is there."""
+    """[h, w, 1] bool: no mask is there, and no artifact that hides more than half of the scene."""
+    hidden: Tensor
+    """[h, w, 1] bool: a mask is there, or an artifact that hides all of it."""
     reduction: int
     """Photo pixels a working pixel."""
 
@@ -97,9 +101,11 @@ def _scene_photo(view: View, group: int, layers: tuple[Tensor, Tensor] | None, a
     shown = torch.ones_like(color[..., :1], dtype=torch.bool)
     if view.mask is not None:
         shown &= reduced((view.mask.reshape(height, width, 1) != 0).to(color), reduction) == 1
+    hidden = ~shown
     if layers is not None:
         transmittance, addition = layers
         shown &= transmittance >= MIN_SHOWN
+        hidden |= transmittance < MAX_HIDDEN
         color = color - (gain if artifact_is_exposed else 1.0) * addition
         color = color / transmittance.clamp_min(MIN_SHOWN)
-    return ScenePhoto(view, group, (color / gain).clamp(0, 1), shown, reduction)
+    return ScenePhoto(view, group, (color / gain).clamp(0, 1), shown, hidden, reduction)

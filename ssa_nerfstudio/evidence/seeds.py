@@ -36,12 +36,6 @@ class Seeds:
         """Those of which `which` [N] is True."""
         return Seeds(self.positions[which], self.colors[which], self.widths[which])
 
-    def moved_out(self, center: Tensor, distance: float) -> Seeds:
-        """As seen from a center [3], but at least at a distance from it, world units, and wider in proportion."""
-        offset = self.positions - center
-        factor = (distance / offset.norm(dim=-1, keepdim=True)).clamp_min(1.0)
-        return Seeds(center + offset * factor, self.colors, self.widths * factor[:, 0])
-
     def table(self) -> Tensor:
         """[N, 7], for a checkpoint: positions, colors and widths."""
         return torch.cat([self.positions, self.colors, self.widths[:, None]], dim=-1)

@@ -137,24 +137,18 @@ class SSASplatfactoModel(PhotoLosses):
             self.exposure.project()
         super().step_post_backward(step)
 
-    def end_training(self, center: Tensor) -> None:
+    def end_training(self, step: int) -> None:
         """After the last step: the scene gets the brightness of the photos' clearest pixels, and its backdrop.
 
         The former not where some photos have no overlay, which fix the brightness, nor where something else stands
-        between the scene and a photo, as exposure or a bilateral grid does. The latter is moved behind all Gaussians:
-        those of a sky reach farther than they started.
-
-        Args:
-            center: of the cameras [3], world units.
+        between the scene and a photo, as exposure or a bilateral grid does.
         """
         alone = self.exposure is None and not self.config.use_bilateral_grid
         learned = self.artifacts.learned()
         if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
         if len(self.artifacts.backdrop):
-            center = center.to(self.means)
-            farthest = float((self.means.data - center).norm(dim=-1).max())
-            backdrop = Seeds.of_table(self.artifacts.backdrop).moved_out(center, farthest)
+            backdrop = Seeds.of_table(self.artifacts.backdrop)
             seed_points.add_seeds(backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
             self.artifacts.backdrop = self.artifacts.backdrop[:0]  # a training that goes on has them already
 

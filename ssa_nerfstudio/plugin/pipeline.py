@@ -246,10 +246,6 @@ class SSAPipeline(VanillaPipeline):
             callbacks.append(TrainingCallback([TrainingCallbackLocation.AFTER_TRAIN_ITERATION], share))
         return callbacks
 
-    def end_training(self, step: int) -> None:
-        """What the model gets after the last step."""
-        self.model.end_training(self.datamanager.train_dataset.cameras.camera_to_worlds[:, :3, 3].mean(dim=0))
-
     def _withheld_photos(self, key: torch.Tensor) -> list[NamedPhoto]:
         """Test photos of the camera with this key of `group_cameras` that have its artifact: stated ones are clean."""
         transforms = self._transforms()

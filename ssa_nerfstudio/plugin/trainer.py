@@ -149,7 +149,7 @@ class SSATrainer(Trainer):
         thin_event_writers(self.config.logging.steps_per_log)
         last = (self.config.max_num_iterations - 1,)
         ending, ended = TrainingCallbackLocation.AFTER_TRAIN_ITERATION, TrainingCallbackLocation.AFTER_TRAIN
-        self.callbacks.append(TrainingCallback([ending], self.pipeline.end_training, iters=last))
+        self.callbacks.append(TrainingCallback([ending], self.pipeline.model.end_training, iters=last))
         self.callbacks.append(TrainingCallback([ended], self._report_artifact))
 
     def _report_artifact(self, step: int) -> None:

@@ -106,7 +106,7 @@ def test_a_floor_is_filled_between_its_sides(angle: float) -> None:
 
 @pytest.mark.parametrize("by", ["artifact", "mask"])
 def test_what_a_photo_hides_others_fill_or_a_backdrop_continues(by: str) -> None:
-    left = torch.where(torch.arange(WIDTH)[:, None] < 60, 0.1, 1.0).expand(HEIGHT, WIDTH, 1)
+    left = torch.where(torch.arange(WIDTH)[:, None] < 60, 0.05, 1.0).expand(HEIGHT, WIDTH, 1)
     photo = wall_view(pose())
     if by == "artifact":
         panel = (left, (1 - left) * torch.tensor([1.0, 0.0, 0.0]))
@@ -129,11 +129,18 @@ def test_what_a_photo_hides_others_fill_or_a_backdrop_continues(by: str) -> None
     assert not len(hidden), "the other photo shows it"
 
 
-def test_a_wrong_match_in_a_gap_spoils_few_seeds() -> None:
+def test_no_backdrop_is_where_a_film_still_shows_the_scene() -> None:
+    """As in the corners behind a vignette: too dark for seeds, but splats learn what is there."""
+    film = torch.full((HEIGHT, WIDTH, 1), 0.3), torch.zeros(HEIGHT, WIDTH, 3)
+    photo = View(wall_view(pose()).image * film[0], None, pose(), K)
+    assert not any(len(seeds) for seeds in filled(wall_points(), [photo], [film]))
+
+
+def test_a_wrong_match_in_a_gap_reaches_no_farther_than_the_seeds_beside_it() -> None:
     stray = torch.tensor([[0.1, 0.0, 1.0]])
     views = [wall_view(pose()), wall_view(pose(right=0.7)), wall_view(pose(right=-0.7))]
     seeds = gaps(torch.cat([wall_points(), stray]), views)
-    assert ((seeds.positions[:, 2] - AT).abs() < 0.01).float().mean() > 0.95
+    assert ((seeds.positions[:, 2] - AT).abs() < 0.01).float().mean() > 0.8
 
 
 def test_large_photos_are_filled_as_small_ones() -> None:
@@ -156,12 +163,11 @@ def test_large_photos_are_filled_as_small_ones() -> None:
     assert (checked < 0.8 * AT).sum() < 0.7 * (alone < 0.8 * AT).sum()
 
 
-@pytest.mark.parametrize(("gap", "right"), [(0.5, -1.0), (1.0, 1.0)], ids=["points", "plain"])
-def test_a_seed_that_hides_what_another_photo_sees_is_left_out(gap: float, right: float) -> None:
-    """Beside a post the neighbors are on it, in front of a wall that another photo sees there."""
+def test_a_seed_that_hides_what_another_photo_sees_is_left_out() -> None:
+    """Beside a post the neighbors are on it, in front of a wall whose points another photo sees there."""
     post = torch.cartesian_prod(torch.linspace(-0.22, -0.16, 8), torch.linspace(-1, 1, 80), torch.tensor([AT / 2]))
-    points = torch.cat([wall_points(gap), post])
-    alone, checked = (gaps(points, [wall_view(pose()), *others]) for others in ([], [wall_view(pose(right))]))
+    points = torch.cat([wall_points(gap=0.5), post])
+    alone, checked = (gaps(points, [wall_view(pose()), *others]) for others in ([], [wall_view(pose(right=-1.0))]))
     alone_near, checked_near = (int((seeds.positions[:, 2] < 0.8 * AT).sum()) for seeds in (alone, checked))
     assert alone_near > 5
     assert checked_near < 0.3 * alone_near

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from ssa_nerfstudio.evidence.point_samples import View
-from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS, MIN_SHOWN, scene_photos
+from ssa_nerfstudio.evidence.scene_photos import MAX_HIDDEN, MAX_VIEWS, MIN_SHOWN, scene_photos
 
 HEIGHT, WIDTH = 12, 16
 
@@ -38,3 +38,17 @@ def test_the_scene_is_what_is_left_of_the_artifact_that_a_view_has() -> None:
     assert masked.shown[1:].all()
     assert not masked.shown[0].any()
     assert film.size == (HEIGHT, WIDTH)
+
+
+def test_between_shown_and_hidden_a_film_leaves_something_of_the_scene() -> None:
+    T = torch.full((HEIGHT, WIDTH, 1), 1.1 * MAX_HIDDEN)
+    T[:, : WIDTH // 2] = 0.9 * MAX_HIDDEN
+    mask = torch.ones(HEIGHT, WIDTH)
+    mask[0] = 0
+    layers = T, torch.zeros(HEIGHT, WIDTH, 3)
+    [dark, masked] = scene_photos([view(0.05), view(0.6, mask)], [layers, None], [0, 1])
+    assert not dark.shown.any()
+    assert dark.hidden[:, : WIDTH // 2].all()
+    assert not dark.hidden[:, WIDTH // 2 :].any()
+    assert torch.equal(masked.hidden, ~masked.shown)
+    assert masked.hidden[0].all()
