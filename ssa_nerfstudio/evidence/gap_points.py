@@ -47,7 +47,7 @@ def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tup
     and is left out.
 
     Then what a photo hides, because of an opaque artifact or a mask, where there are neither points nor seeds: probably
-    no photo shows it. It continues the colors around, behind everything, because splats that photos show may be there.
+    no photo shows it. It continues the colors around, far away, because splats that photos show may be there.
 
     Args:
         points: of the scene [P, 3], world units, finite; at least one.

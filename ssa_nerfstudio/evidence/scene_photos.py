@@ -17,7 +17,7 @@ MAX_VIEWS = 128
 MIN_SHOWN = 0.5
 """Transmittance of the artifact below which a pixel does not count."""
 MAX_HIDDEN = 0.1
-"""Transmittance below which a pixel says nothing of the scene: what it says is in proportion to the square."""
+"""Transmittance below which a pixel says next to nothing of the scene: what it says is in proportion to the square."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ScenePhoto:
     shown: Tensor
     """[h, w, 1] bool: no mask is there, and no artifact that hides more than half of the scene."""
     hidden: Tensor
-    """[h, w, 1] bool: a mask is there, or an artifact that hides all of it."""
+    """[h, w, 1] bool: a mask is there, or an artifact that hides nearly all of the scene."""
     reduction: int
     """Photo pixels a working pixel."""
 

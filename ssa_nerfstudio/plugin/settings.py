@@ -64,7 +64,7 @@ class ModelSettings(SplatfactoModelConfig):
     gap_seeds: bool = True
     """Where an overlay is trained with overlay_start "points", or given: start also from Gaussians where photos show no
     points of structure from motion, such as plain walls and roads, at the depth of the points around them; and end with
-    a backdrop where the artifact hides the scene from all photos. False: without these. Not with random_init."""
+    a backdrop behind what the artifact hides. False: without these. Not with random_init."""
     strategy: Literal["auto", "adc", "mcmc"] = "auto"
     """Densification. adc: adaptive density control, splatfacto's; mcmc: up to a fixed number of Gaussians, cap_max;
     auto: mcmc where at least 7,000 steps are trained, adc in shorter trainings, where it is mostly ahead; a resumed run

@@ -45,10 +45,14 @@ def test_between_shown_and_hidden_a_film_leaves_something_of_the_scene() -> None
     T[:, : WIDTH // 2] = 0.9 * MAX_HIDDEN
     mask = torch.ones(HEIGHT, WIDTH)
     mask[0] = 0
-    layers = T, torch.zeros(HEIGHT, WIDTH, 3)
-    [dark, masked] = scene_photos([view(0.05), view(0.6, mask)], [layers, None], [0, 1])
+    # Transmittances may differ between the colors.
+    layers = T * torch.tensor([0.5, 1.0, 1.5]), torch.zeros(HEIGHT, WIDTH, 3)
+    [dark, both, masked] = scene_photos(
+        [view(0.05), view(0.05, mask), view(0.6, mask)], [layers] * 2 + [None], [0, 0, 1]
+    )
     assert not dark.shown.any()
     assert dark.hidden[:, : WIDTH // 2].all()
     assert not dark.hidden[:, WIDTH // 2 :].any()
     assert torch.equal(masked.hidden, ~masked.shown)
+    assert torch.equal(both.hidden, dark.hidden | masked.hidden)
     assert masked.hidden[0].all()
