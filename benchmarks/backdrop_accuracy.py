@@ -13,6 +13,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from unittest.mock import patch
 
+from torch import Tensor
+from torch.nn import Parameter
+
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.cli.option_bounds import Count, Factor, Share
 from ssa_nerfstudio.data.transforms import Transforms
@@ -20,6 +23,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.seeds import Seeds
 
 if TYPE_CHECKING:
+    from ssa_nerfstudio.experiments.runs.training_run import Outcome
     from ssa_nerfstudio.plugin.pipeline import SSAPipeline
 
 
@@ -45,18 +49,21 @@ class Command:
             InputError: the dataset cannot be trained on, or no overlay was trained.
         """
         Transforms.read(self.data)
-        pipeline = self._train()
+        from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
+        from ssa_nerfstudio.experiments.runs.training_run import evaluate
+
+        outcome, pipeline = self._train()
         if not len(pipeline.model.artifacts):
             raise InputError("no overlay was trained", "add overlay=on to --settings")
         bare = {name: values.data for name, values in pipeline.model.gauss_params.items()}
         print("| hidden where T is below | seeds | PSNR, dB | test views |", "|---|---|---|---|", sep="\n")
-        print(f"| no backdrop | | {_psnr(pipeline)} |")
+        print(f"| no backdrop | | {_psnr(outcome.views)} |")
         for limit in self.hidden:
             backdrop = _backdrop(pipeline, limit)
             _put(pipeline, bare, backdrop)
-            print(f"| {limit:g} | {len(backdrop)} | {_psnr(pipeline)} |")
+            print(f"| {limit:g} | {len(backdrop)} | {_psnr(evaluate(pipeline, FlipProcesses(1)))} |")
 
-    def _train(self) -> SSAPipeline:
+    def _train(self) -> tuple[Outcome, SSAPipeline]:
         """A training that ends without a backdrop."""
         from ssa_nerfstudio.experiments.runs.run_configuration import configure, model_settings
         from ssa_nerfstudio.experiments.runs.training_run import train_and_evaluate
@@ -71,11 +78,12 @@ class Command:
         settings = model_settings(self.settings)
         with tempfile.TemporaryDirectory() as scratch, patch.object(extra_seeds, "gap_points", between):
             config = configure("ssa-splatfacto", self.data, Path(scratch), self.steps, settings, self.scale_factor)
-            _, pipeline, _ = train_and_evaluate(config, test_scale=1.0)
-        return pipeline
+            outcome, pipeline, _ = train_and_evaluate(config, test_scale=1.0)
+        return outcome, pipeline
 
 
 def _backdrop(pipeline: SSAPipeline, limit: float) -> Seeds:
+    """Seeds where the learned artifact has a transmittance below a limit."""
     from ssa_nerfstudio.evidence import scene_photos
     from ssa_nerfstudio.plugin.extra_seeds import photos_of_scene, seeds_between
 
@@ -86,24 +94,19 @@ def _backdrop(pipeline: SSAPipeline, limit: float) -> Seeds:
     return seeds_between(points, photos).backdrop
 
 
-def _put(pipeline: SSAPipeline, bare: dict[str, Any], backdrop: Seeds) -> None:
+def _put(pipeline: SSAPipeline, bare: dict[str, Tensor], backdrop: Seeds) -> None:
     """Give the scene Gaussians [N, ...] and a backdrop behind them."""
-    from torch.nn import Parameter
-
-    from ssa_nerfstudio.plugin.training.seed_points import add_seeds
+    from ssa_nerfstudio.plugin.training.seed_points import BACKDROP_OPACITY, add_seeds
 
     model = pipeline.model
     for name, values in bare.items():
         model.gauss_params[name] = Parameter(values.clone())
-    add_seeds(backdrop, model.gauss_params, model.config.sh_degree, 0.99)
+    add_seeds(backdrop, model.gauss_params, model.config.sh_degree, BACKDROP_OPACITY)
 
 
-def _psnr(pipeline: SSAPipeline) -> str:
+def _psnr(views: dict[str, dict[str, float]]) -> str:
     """Mean over test views, and each of them."""
-    from ssa_nerfstudio.experiments.runs.flip_processes import FlipProcesses
-    from ssa_nerfstudio.experiments.runs.training_run import evaluate
-
-    values = [view["psnr"] for view in evaluate(pipeline, FlipProcesses(1)).values()]
+    values = [view["psnr"] for view in views.values()]
     return f"{statistics.mean(values):.2f} | {', '.join(f'{value:.1f}' for value in values)}"
 
 

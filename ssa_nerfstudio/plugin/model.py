@@ -149,7 +149,8 @@ class SSASplatfactoModel(PhotoLosses):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
         if len(self.artifacts.backdrop):
             backdrop = Seeds.of_table(self.artifacts.backdrop)
-            seed_points.add_seeds(backdrop, self.gauss_params, self.config.sh_degree, 0.99, self.optimizers)
+            opacity = seed_points.BACKDROP_OPACITY
+            seed_points.add_seeds(backdrop, self.gauss_params, self.config.sh_degree, opacity, self.optimizers)
             self.artifacts.backdrop = self.artifacts.backdrop[:0]  # a training that goes on has them already
 
     def load_state_dict(self, dict: dict[str, Any], **kwargs):  # type: ignore[override]

@@ -20,6 +20,8 @@ MIN_DISTANCE = NEAR_PLANE
 """A seed point nearer to a camera than this (world units) is inside it: that camera never draws it."""
 NEAREST_SHARE = 0.001
 """Share of all projections of seed points that may be nearer than `nearest_depth`: wrong matches."""
+BACKDROP_OPACITY = 0.99
+"""Of seeds behind what no photo shows: opaque, and a logit that is finite."""
 
 
 def nearest_depth(points: Tensor, view_matrices: Tensor, Ks: Tensor, width: int, height: int) -> float | None:
