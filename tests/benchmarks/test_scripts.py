@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
-import os
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -22,24 +20,6 @@ def test_the_readme_lists_every_script():
     rows = re.findall(r"^\| `(\w+\.py)` \|.*`python benchmarks/(\w+\.py)", (FOLDER / "README.md").read_text(), re.M)
     assert [listed for listed, _ in rows] == [called for _, called in rows]
     assert sorted(listed for listed, _ in rows) == sorted(path.name for path in FOLDER.glob("*.py"))
-
-
-@pytest.fixture
-def call(monkeypatch, capsys):
-    """Call a script as a process would, which has the script's folder on its path: exit code, output and errors."""
-    for imported in [each for each in sys.modules if each.partition(".")[0] == "benchmarks"]:
-        monkeypatch.delitem(sys.modules, imported)
-    monkeypatch.setitem(sys.modules, "benchmarks", None)  # cannot be imported
-    monkeypatch.syspath_prepend(FOLDER)
-
-    def called(name: str, *arguments: str) -> tuple[int | str | None, str, str]:
-        path = os.path.relpath(FOLDER / name)
-        monkeypatch.setattr(sys, "argv", [path, *arguments])
-        with pytest.raises(SystemExit) as end:
-            runpy.run_path(path, run_name="__main__")
-        return end.value.code, *capsys.readouterr()
-
-    return called
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.py")))
@@ -154,6 +134,12 @@ REFUSED = [
     ("step_time --data x --gaussians -1", "--gaussians must be at least 0, got -1"),
     ("step_time --data x --profile n/x", f"--profile must be a {FILE} n/x"),
     ("step_time --data x --profile scene", f"--profile must be a {FILE} scene"),
+    ("time_to_quality --clean x --data x --output n/x", f"--output must be a {FILE} n/x"),
+    ("time_to_quality --clean x --data x --output r --methods splatfacto", "invalid choice 'splatfacto'"),
+    ("time_to_quality --clean x --data x --output r --methods", "--methods has no value"),
+    ("time_to_quality --clean x --data x --output r --seeds -1", "--seeds must be at least 0, got -1"),
+    ("time_to_quality --clean scene --data torn --output r", "transforms.json lists 1 photo"),
+    ("time_to_quality --clean scene --data scene --output text", "text holds no results of this script"),
     ("restored_photos --load-config x --photos x --clean x --threshold 3", "--threshold must be in (0, 1), got 3"),
     ("divergence --data x --output n --overlay", "--overlay has no value"),
     ("divergence --data x --output n --steps 0", "--steps must be at least 1, got 0"),
