@@ -1,6 +1,6 @@
-"""Seconds until photos behind an artifact give as good a scene as clean photos do: `python benchmarks/time_to_quality.py`
+"""Seconds until photos behind an artifact give as good a scene as clean ones: `python benchmarks/time_to_quality.py`
 
-nerfstudio's splatfacto trains on the clean photos with its own settings, then this plugin's methods on the photos behind
+nerfstudio's splatfacto trains on the clean photos with its own settings, then this plugin's methods on the photos with
 the artifact, one after another on one device. What is wanted is splatfacto's PSNR less 0.1 dB, on the same clean test
 views. The photos are decoded and the model is set up before a clock starts; evaluation comes after it has stopped. The
 overlay's statistics count.

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -20,6 +22,24 @@ def test_the_readme_lists_every_script():
     rows = re.findall(r"^\| `(\w+\.py)` \|.*`python benchmarks/(\w+\.py)", (FOLDER / "README.md").read_text(), re.M)
     assert [listed for listed, _ in rows] == [called for _, called in rows]
     assert sorted(listed for listed, _ in rows) == sorted(path.name for path in FOLDER.glob("*.py"))
+
+
+@pytest.fixture
+def call(monkeypatch, capsys):
+    """Call a script as a process would, which has the script's folder on its path: exit code, output and errors."""
+    for imported in [each for each in sys.modules if each.partition(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, imported)
+    monkeypatch.setitem(sys.modules, "benchmarks", None)  # cannot be imported
+    monkeypatch.syspath_prepend(FOLDER)
+
+    def called(name: str, *arguments: str) -> tuple[int | str | None, str, str]:
+        path = os.path.relpath(FOLDER / name)
+        monkeypatch.setattr(sys, "argv", [path, *arguments])
+        with pytest.raises(SystemExit) as end:
+            runpy.run_path(path, run_name="__main__")
+        return end.value.code, *capsys.readouterr()
+
+    return called
 
 
 @pytest.mark.parametrize("name", sorted(path.name for path in FOLDER.glob("*.py")))
