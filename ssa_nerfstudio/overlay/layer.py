@@ -133,7 +133,13 @@ class ScreenSpaceOverlay(nn.Module):
             return torch.sigmoid(torch.maximum(self.alpha_logits, self.color_logits.amax(dim=-1, keepdim=True)))
         return self.matte()
 
-    def composite(self, clean: Tensor, reduction: int = 1, behind: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    def composite(
+        self,
+        clean: Tensor,
+        reduction: int = 1,
+        behind: tuple[Tensor, Tensor] | None = None,
+        light: Tensor | None = None,
+    ) -> Tensor:
         """Composite the overlay over a render: I = T C + B.
 
         Args:
@@ -141,20 +147,22 @@ class ScreenSpaceOverlay(nn.Module):
             reduction: 1, 2, 4 or 8: factor by which training images are reduced.
             behind: opacity of the splats [H // reduction, W // reduction, 1] and color of the background [3], for the
                 matte's gradient of `composite_over_splats`; None for plain compositing.
+            light: a factor of B, of the render's shape; None for 1.
 
         Returns:
             I, of the render's shape; not clipped.
         """
         if self.reliable.numel() > 1 and clean.requires_grad:
             clean = torch.lerp(clean.detach(), clean, self._at_training_scale(self.reliable, reduction))
-        if self.resolution == reduction == 1 and not self.adds_light:
+        if self.resolution == reduction == 1 and not self.adds_light and light is None:
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         else:
-            layers = self.before_falloff(reduction)
+            transmittance, addition = self.before_falloff(reduction)
+            addition = addition if light is None else light * addition
             if behind is None:
-                image = composite(clean, *layers)
+                image = composite(clean, transmittance, addition)
             else:
-                image = composite_over_splats(clean, *behind, *layers, self.adds_light)
+                image = composite_over_splats(clean, *behind, transmittance, addition, self.adds_light)
         return image if self.falloff.numel() == 1 else image * self.falloff_at(reduction)
 
     def layers(self, reduction: int = 1) -> tuple[Tensor, Tensor]:

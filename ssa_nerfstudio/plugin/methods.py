@@ -68,6 +68,10 @@ def _trainer(name: str, model: SSASplatfactoModelConfig, steps: int = DEFAULT_LE
                 "optimizer": FusedAdamConfig(lr=5e-3),
                 "scheduler": ExponentialDecaySchedulerConfig(lr_final=5e-4, max_steps=FULL_LENGTH),
             },
+            "shading": {
+                "optimizer": FusedAdamConfig(lr=1.5e-3),
+                "scheduler": ExponentialDecaySchedulerConfig(lr_final=1.5e-4, max_steps=FULL_LENGTH),
+            },
             "camera_opt": {
                 "optimizer": FusedAdamConfig(lr=1e-4),
                 "scheduler": ExponentialDecaySchedulerConfig(

@@ -24,6 +24,7 @@ from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
 from ssa_nerfstudio.plugin.photo_formation import clean_image
 from ssa_nerfstudio.plugin.photo_losses import PhotoLosses
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.shading import Shading, check_checkpoint
 from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
 from ssa_nerfstudio.plugin.training import nonfinite, seed_points
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
@@ -69,6 +70,7 @@ class SSASplatfactoModel(PhotoLosses):
             self.gauss_params["features_dc"] = Parameter(seed_points.color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
+        self.shading = Shading(self.num_train_data) if self.config.shading == "affine" else None
         self._draw = SplatRenderer(self.config.rasterizer)
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
@@ -135,15 +137,17 @@ class SSASplatfactoModel(PhotoLosses):
                 overlay.clamp_logits()
         if self.exposure is not None:
             self.exposure.project()
+        if self.shading is not None:
+            self.shading.project()
         super().step_post_backward(step)
 
     def end_training(self, step: int) -> None:
         """After the last step: the scene gets the brightness of the photos' clearest pixels, and its backdrop.
 
         The former not where some photos have no overlay, which fix the brightness, nor where something else stands
-        between the scene and a photo, as exposure or a bilateral grid does.
+        between the scene and a photo, as exposure or a bilateral grid does, or the overlay's light varies.
         """
-        alone = self.exposure is None and not self.config.use_bilateral_grid
+        alone = self.exposure is None and self.shading is None and not self.config.use_bilateral_grid
         learned = self.artifacts.learned()
         if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
@@ -165,6 +169,12 @@ class SSASplatfactoModel(PhotoLosses):
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         fit_checkpoint(self.exposure, dict, "exposure.")
+        if self.training:
+            check_checkpoint(self.shading, dict, "shading.")
+        else:  # what is rendered has the mean light
+            self.shading = None
+            for name in [name for name in dict if name.startswith("shading.")]:
+                del dict[name]
         if self.training and self._near_plane_is_set:  # a resumed run has its own clearance
             dict["near_plane"] = self.near_plane
         dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored
@@ -174,8 +184,8 @@ class SSASplatfactoModel(PhotoLosses):
         return loaded
 
     def get_param_groups(self) -> dict[str, list[Parameter]]:
-        """splatfacto's groups, and `overlay` and `exposure` where they are learned."""
-        own = {"overlay": self.artifacts, "exposure": self.exposure}
+        """splatfacto's groups, and `overlay`, `exposure` and `shading` where they are learned."""
+        own = {"overlay": self.artifacts, "exposure": self.exposure, "shading": self.shading}
         parameters = {name: list(module.parameters()) for name, module in own.items() if module is not None}
         return super().get_param_groups() | {name: learned for name, learned in parameters.items() if learned}
 

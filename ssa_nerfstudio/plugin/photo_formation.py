@@ -13,8 +13,10 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ssa_nerfstudio.overlay.compositing import clip_straight_through
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
+from ssa_nerfstudio.plugin.shading import Shading
 
 
 def clean_image(color: Tensor, accumulation: Tensor, background: Tensor, white: float) -> Tensor:
@@ -37,10 +39,12 @@ def predicted_photo(
     view: int | None,
     reduction: int,
     ignore_background: bool,
+    shading: Shading | None = None,
 ) -> Tensor | None:
     """Predict a training photo, [H // reduction, W // reduction, 3].
 
-    With T and B of the overlay and E of the exposure: E(T C + B), or T E(C) + B where exposure acts on the scene.
+    With T and B of the overlay, which shading multiplies by the photo's light, and E of the exposure: E(T C + B), or
+    T E(C) + B where exposure acts on the scene.
 
     Args:
         drawn: the model's outputs: rgb C, accumulation and background.
@@ -49,6 +53,7 @@ def predicted_photo(
         view: the training view; None: the camera is none.
         reduction: factor by which training images are reduced.
         ignore_background: see `compositing.composite_over_splats`.
+        shading: of the learned overlays; None where the light on them is the same in all photos.
 
     Returns:
         None where the photo is the clean render.
@@ -63,7 +68,11 @@ def predicted_photo(
     if exposed is not None and exposure is not None and exposure.place == "scene":
         # Where nothing is drawn, the exposed render shows the exposed background.
         clean, background, exposed = exposed.expose(clean), exposed.expose(background), None
-    photo = overlay.composite(clean, reduction, (drawn["accumulation"], background) if ignore_background else None)
+    behind = (drawn["accumulation"], background) if ignore_background else None
+    if shading is not None and isinstance(overlay, ScreenSpaceOverlay):
+        photo = overlay.composite(clean, reduction, behind, shading.of_view(view, overlay, reduction))
+    else:
+        photo = overlay.composite(clean, reduction, behind)
     if exposed is not None:
         return exposed.expose(photo)
-    return clip_straight_through(photo) if artifacts.exceed_white else photo
+    return clip_straight_through(photo) if artifacts.exceed_white or shading is not None else photo

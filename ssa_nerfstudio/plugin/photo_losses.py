@@ -18,6 +18,7 @@ from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
 from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
 from ssa_nerfstudio.plugin.settings import ModelSettings
+from ssa_nerfstudio.plugin.shading import Shading
 from ssa_nerfstudio.plugin.splat_rendering import LearnedRender
 
 
@@ -27,6 +28,7 @@ class PhotoLosses(SplatfactoModel):
     config: ModelSettings
     artifacts: Artifacts
     exposure: Exposure | None
+    shading: Shading | None
     recordable: bool = True
     """Whether nothing but `_photo_losses` reads the pictures of a training step, so that they need not be there, and
     the sum of the losses is what is minimized, not a multiple of it."""
@@ -114,7 +116,7 @@ class PhotoLosses(SplatfactoModel):
     def _with_photo(self, drawn: dict[str, Any], view: int | None) -> dict[str, Any]:
         """What is drawn for a training view, and `composite` where the photo is predicted as another image."""
         reduction, ignored = self._get_downscale_factor(), self.config.ignore_background
-        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored)
+        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored, self.shading)
         return drawn if photo is None else {**drawn, "composite": photo}
 
     def _losses_are_recorded(self, with_depth: bool) -> bool:
@@ -123,5 +125,5 @@ class PhotoLosses(SplatfactoModel):
 
     def _can_be_recorded(self, with_depth: bool) -> bool:
         """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
-        settings = with_depth or self.config.use_bilateral_grid or self.exposure is not None
-        return self.training and self.recordable and torch.is_grad_enabled() and not settings
+        of_views = self.config.use_bilateral_grid or self.exposure is not None or self.shading is not None
+        return self.training and self.recordable and torch.is_grad_enabled() and not (with_depth or of_views)

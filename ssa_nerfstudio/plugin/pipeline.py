@@ -104,6 +104,7 @@ class SSAPipeline(VanillaPipeline):
             check_masks(photos, group_cameras(dataset.cameras)[1], self.datamanager.photo_names(dataset))
         samples = self._start_exposure()
         self._set_overlays(photos, lenses)
+        self._start_shading(photos)
         self.sphere = self._shared_sphere()
         if self.model.exposure is not None and samples is not None and len(self.model.artifacts):
             by_photos = self.config.model.exposure_place == "auto"
@@ -157,6 +158,16 @@ class SSAPipeline(VanillaPipeline):
         if self.config.artifacts_of:
             return None  # of a resumed run
         return start_from_points(exposure, self.datamanager.cached_train, photos.cameras, self._points())
+
+    def _start_shading(self, photos: list[dict[str, Any]]) -> None:
+        model = self.model
+        if not model.artifacts.learned():
+            model.shading = None
+        if model.shading is None:
+            return
+        model.shading.assign(model.artifacts, self.datamanager.photo_names(self.datamanager.train_dataset))
+        if model.exposure is None and not self.config.artifacts_of:
+            model.shading.start_from(model.artifacts, photos)
 
     def _points(self) -> torch.Tensor | None:
         """Of the scene, [N, 3]."""

@@ -1,0 +1,45 @@
+"""The light on an artifact: brightness and tint that change linearly over it, as a factor of its own light B."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+COEFFICIENTS = 5
+"""Logarithms of the gains of red, green and blue in the artifact's middle, and their change to the right and downwards,
+a standard deviation of its extent."""
+_HALF_WIDTH = math.sqrt(3)
+"""Of an artifact of constant opacity, standard deviations of its extent. The light stays the same beyond."""
+
+
+def shading_basis(opacity: Tensor) -> Tensor:
+    """What the coefficients of a photo are multiplied by, [h, w, 3]: the opacity, and it times both coordinates.
+
+    So nothing changes where nothing is in front of the scene.
+
+    Args:
+        opacity: of the artifact [h, w, 1] in [0, 1].
+    """
+    height, width = opacity.shape[:2]
+    rows = torch.arange(height, dtype=opacity.dtype, device=opacity.device)[:, None, None]
+    columns = torch.arange(width, dtype=opacity.dtype, device=opacity.device)[None, :, None]
+    total = opacity.sum().clamp_min(torch.finfo(opacity.dtype).tiny)
+    coordinates = []
+    for place in (columns, rows):
+        offset = place - (opacity * place).sum() / total
+        deviation = ((opacity * offset.square()).sum() / total).sqrt().clamp_min(0.5)  # of an artifact of one pixel
+        coordinates.append((offset / deviation).clamp(-_HALF_WIDTH, _HALF_WIDTH).expand_as(opacity))
+    return torch.cat([opacity, *(opacity * each for each in coordinates)], dim=-1)
+
+
+def light(basis: Tensor, coefficients: Tensor) -> Tensor:
+    """The factor of B in a photo, [h, w, 3], above 0.
+
+    Args:
+        basis: [h, w, 3] (`shading_basis`).
+        coefficients: of the photo [COEFFICIENTS].
+    """
+    gains, slopes = coefficients.split((3, 2))
+    return torch.exp(basis @ torch.cat([gains[None], slopes[:, None].expand(2, 3)]))

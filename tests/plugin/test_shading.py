@@ -1,0 +1,264 @@
+"""Shading: the light on an artifact in each photo, its start from the photos, and whole trainings with it."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence.artifact_light import artifact_light
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.shading import light, shading_basis
+from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.model import SSASplatfactoModel
+from ssa_nerfstudio.plugin.photo_formation import predicted_photo
+from ssa_nerfstudio.plugin.shading import Shading
+
+HEIGHT, WIDTH, VIEWS = 40, 60, 9
+
+
+def opacity(dtype=torch.float64) -> torch.Tensor:
+    """An artifact in the lower right, with a soft rim to its left."""
+    made = torch.zeros(HEIGHT, WIDTH, 1, dtype=dtype)
+    made[20:, 30:], made[20:, 28:30] = 1.0, 0.4
+    return made
+
+
+def coefficients() -> torch.Tensor:
+    drawn = 0.1 * torch.randn(VIEWS, 5, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return drawn - drawn.mean(dim=0)
+
+
+def test_the_light_is_linear_over_the_artifact_and_1_where_there_is_none():
+    basis = shading_basis(opacity())
+    assert (light(basis, torch.ones(5, dtype=torch.float64))[:, :28] == 1).all()
+    inside = basis[22:38, 32:58]
+    torch.testing.assert_close(inside[..., 0], torch.ones(16, 26, dtype=torch.float64))
+    steps = inside[:, 1:, 1] - inside[:, :-1, 1]
+    torch.testing.assert_close(steps, steps[0, 0].expand_as(steps))
+    assert abs(float((opacity() * basis[..., 1:] / opacity().clamp_min(1)).sum(dim=(0, 1)).max())) < 40  # centered
+    tinted = light(basis, torch.tensor([0.1, 0.0, -0.1, 0.0, 0.0], dtype=torch.float64))[30, 40]
+    torch.testing.assert_close(tinted, torch.tensor([0.1, 0.0, -0.1], dtype=torch.float64).exp())
+    assert basis.abs().max() <= np.sqrt(3) + 1e-12
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_the_start_finds_the_light_on_what_is_opaque(masked):
+    basis, addition = shading_basis(opacity()), opacity() * torch.tensor([0.5, 0.3, 0.2], dtype=torch.float64)
+    scenes = torch.rand(VIEWS, HEIGHT, WIDTH, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    images = [
+        ((1 - opacity()) * scene + light(basis, own) * addition).float()
+        for scene, own in zip(scenes, coefficients(), strict=True)
+    ]
+    masks: list[torch.Tensor | None] = [None] * VIEWS
+    if masked:  # something else in one photo
+        masks[3] = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+        masks[3][20:30] = False
+        images[3] = images[3].clone()
+        images[3][20:30] = 1.0
+    found = artifact_light(images, masks, basis.float(), addition.float())
+    torch.testing.assert_close(found.mean(dim=0), torch.zeros(5), atol=1e-6, rtol=0)
+    torch.testing.assert_close(found, coefficients().float(), atol=0.03, rtol=0)
+
+
+def test_without_an_opaque_pixel_the_light_is_the_same_everywhere():
+    basis = shading_basis(0.4 * opacity(torch.float32))
+    images = [torch.rand(HEIGHT, WIDTH, 3) for _ in range(VIEWS)]
+    assert not artifact_light(images, [None] * VIEWS, basis, torch.rand(HEIGHT, WIDTH, 3)).any()
+    assert not shading_basis(torch.zeros(3, 4, 1)).any()
+
+
+def artifacts(adds_light: bool = False) -> tuple[Artifacts, ScreenSpaceOverlay]:
+    """An overlay of 3 x 4 pixels with random parameters, of views 0 and 1; view 2 has none."""
+    generator = torch.Generator().manual_seed(0)
+    overlay = ScreenSpaceOverlay(3, 4, adds_light=adds_light)
+    with torch.no_grad():
+        for parameter in overlay.parameters():
+            parameter.normal_(generator=generator)
+        overlay.evidence.uniform_(generator=generator)
+    made = Artifacts()
+    made.assign([overlay, None], torch.ones(2, 6), [0, 0, 1], torch.zeros(2, 16))
+    return made.double(), overlay
+
+
+def shading(made: Artifacts) -> Shading:
+    found = Shading(3).double()
+    found.assign(made, ["a", "b", "c"])
+    with torch.no_grad():
+        found.coefficients.uniform_(-0.2, 0.2, generator=torch.Generator().manual_seed(2))
+    return found
+
+
+@pytest.mark.parametrize("adds_light", [False, True])
+@pytest.mark.parametrize("ignore_background", [False, True])
+def test_the_photos_light_falls_on_the_artifact_alone(adds_light, ignore_background):
+    made, overlay = artifacts(adds_light)
+    own, (transmittance, addition) = shading(made), overlay.layers()
+    drawn = {
+        "rgb": 0.5 * torch.rand(3, 4, 3).double(),
+        "accumulation": torch.ones(3, 4, 1),
+        "background": torch.zeros(3),
+    }
+    for view in (0, 1):
+        factor = light(shading_basis(1 - overlay.evidence), own.coefficients[view])
+        photo = predicted_photo(drawn, made, None, view, 1, ignore_background, own)
+        torch.testing.assert_close(photo, (transmittance * drawn["rgb"] + factor * addition).clamp(0, 1))
+    assert predicted_photo(drawn, made, None, 2, 1, ignore_background, own) is None
+
+
+def test_the_gradient_is_of_the_photo_that_is_shown():
+    made, overlay = artifacts()
+    own = shading(made)
+    drawn = {
+        "rgb": 0.5 * torch.rand(3, 4, 3).double(),
+        "accumulation": torch.ones(3, 4, 1),
+        "background": torch.zeros(3),
+    }
+
+    def photo(*_) -> torch.Tensor:
+        shown = predicted_photo(drawn, made, None, 1, 1, False, own)
+        assert shown is not None
+        return shown
+
+    assert photo().max() < 1
+    assert torch.autograd.gradcheck(photo, (own.coefficients, overlay.color_logits, overlay.alpha_logits))
+    (gradient,) = torch.autograd.grad(photo().sum(), own.coefficients)
+    assert (gradient[1] != 0).all()
+    assert not gradient[[0, 2]].any()
+
+
+def test_each_overlay_has_the_mean_light_of_its_photos():
+    own = shading(artifacts()[0])
+    before = own.coefficients.detach().clone()
+    own.project()
+    torch.testing.assert_close(own.coefficients[:2].mean(dim=0), torch.zeros(5).double(), atol=1e-12, rtol=0)
+    torch.testing.assert_close(own.coefficients[0] - own.coefficients[1], before[0] - before[1])
+    assert not own.coefficients[2].any()
+
+
+@pytest.fixture(scope="module")
+def varying_scene(write_built_in_scene, composited_layers, tmp_path_factory) -> tuple[Path, np.ndarray]:
+    """The built-in scene behind a panel, under another light in every photo, and the logarithms of its brightness."""
+    matte = np.zeros((48, 64), np.float32)
+    matte[30:] = 0.98
+    panel = composited_layers(matte, np.full((48, 64, 3), [0.5, 0.35, 0.3], np.float32))
+    folder = tmp_path_factory.mktemp("shaded") / "scene"
+    write_built_in_scene(folder, panel, views=12, test_views=3, width=64, height=48)
+    logs = np.linspace(-0.15, 0.15, 12)[np.random.default_rng(0).permutation(12)]
+    for brightness, path in zip(logs, sorted(folder.glob("images/train_*.png")), strict=True):
+        photo = np.asarray(Image.open(path)) / 255 + (np.exp(brightness) - 1) * panel.addition
+        Image.fromarray(np.rint(255 * photo.clip(0, 1)).astype(np.uint8)).save(path)
+    return folder, logs
+
+
+@pytest.fixture(scope="module")
+def train(varying_scene, configure_training, tmp_path_factory):
+    """Train on the varying scene, given settings of the model, steps, and a folder of checkpoints to resume from."""
+
+    def run(steps: int = 30, load_dir: Path | None = None, **model):
+        model = {"overlay": "on", "num_downscales": 0, "shading": "affine", **model}
+        config = configure_training("ssa-splatfacto", varying_scene[0], tmp_path_factory.mktemp("run"), steps, model)
+        config.load_dir, config.vis = load_dir, "tensorboard"
+        config.scale_schedules = False
+        config.set_timestamp()
+        config.save_config()
+        random.seed(0)
+        torch.manual_seed(0)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.train()
+        return trainer
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def trained(train):
+    return train()
+
+
+def test_a_training_finds_the_light(trained, varying_scene):
+    found = trained.pipeline.model.shading.coefficients.detach().cpu()
+    torch.testing.assert_close(found.mean(dim=0), torch.zeros(5), atol=1e-6, rtol=0)
+    logs = varying_scene[1]
+    assert np.corrcoef(found[:, :3].mean(dim=1).numpy(), logs)[0, 1] > 0.95
+
+
+def test_it_explains_the_photos_of_the_artifact(trained, train):
+    def error(trainer) -> float:
+        pipeline, errors = trainer.pipeline, []
+        photos, cameras = pipeline.datamanager.cached_train, pipeline.datamanager.train_dataset.cameras
+        for view, photo in enumerate(photos):
+            camera = cameras[view : view + 1].to(pipeline.device)
+            camera.metadata = {"cam_idx": view}
+            outputs = pipeline.model.get_outputs(camera)
+            shown = outputs["composite"].detach().cpu() - photo["image"].cpu()[..., :3] / 255
+            errors.append(float(shown[32:].square().mean()))
+        return float(np.mean(errors))
+
+    assert error(trained) < 0.3 * error(train(shading="off"))
+
+
+def test_other_views_have_the_mean_light(trained):
+    model, pipeline = trained.pipeline.model, trained.pipeline
+    pipeline.eval()
+    camera, _ = next(iter(pipeline.datamanager.fixed_indices_eval_dataloader))
+    torch.testing.assert_close(
+        model.get_outputs_for_camera(camera)["overlay_alpha"],
+        1 - model.artifacts[0].layers()[0].detach(),
+        atol=0.02,
+        rtol=0,
+    )
+    pipeline.train()
+
+
+def test_off_leaves_no_trace(train):
+    trainer = train(steps=1, shading="off")
+    assert trainer.pipeline.model.shading is None
+    assert not [name for name in trainer.pipeline.state_dict() if "shading" in name]
+    assert "shading" not in trainer.optimizers.optimizers
+
+
+def test_nothing_is_shaded_where_no_overlay_is_learned(train):
+    trainer = train(steps=1, overlay="off")
+    assert trainer.pipeline.model.shading is None
+    assert "shading" not in trainer.optimizers.optimizers
+
+
+def test_a_resumed_training_goes_on_with_it(train):
+    first = train(steps=12)
+    resumed = train(steps=13, load_dir=first.checkpoint_dir)
+    assert resumed._start_step == 12
+    then, now = (trainer.pipeline.model.shading for trainer in (first, resumed))
+    assert now.photos == then.photos
+    change = (now.coefficients - then.coefficients).abs().max()
+    assert 0 < change < 0.02
+
+
+def test_a_checkpoint_of_another_setting_or_of_other_photos_is_refused(train, trained):
+    with pytest.raises(InputError, match="the checkpoint has a shading"):
+        train(steps=35, load_dir=trained.checkpoint_dir, shading="off")
+    with pytest.raises(InputError, match="the checkpoint has no shading"):
+        train(steps=35, load_dir=train(steps=1, shading="off").checkpoint_dir)
+    own = trained.pipeline.model.shading
+    photos = own.photos
+    own.photos = photos[::-1]
+    trained.save_checkpoint(29)
+    own.photos = photos
+    with pytest.raises(InputError, match="resume with the photos"):
+        train(steps=35, load_dir=trained.checkpoint_dir)
+
+
+def test_a_run_with_it_can_be_rendered(trained):
+    from nerfstudio.utils.eval_utils import eval_setup
+
+    _, pipeline, _, _ = eval_setup(trained.config.get_base_dir() / "config.yml", test_mode="test")
+    model = pipeline.model
+    assert isinstance(model, SSASplatfactoModel)
+    assert model.shading is None
+    assert len(model.artifacts) == 1
