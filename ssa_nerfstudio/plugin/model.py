@@ -20,11 +20,11 @@ from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.compat.nerfstudio_repairs import without_torchmetrics
 from ssa_nerfstudio.plugin.datamanager import SSADatamanager
 from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_metrics
-from ssa_nerfstudio.plugin.exposure import BRIGHTEST, Exposure, fit_checkpoint
+from ssa_nerfstudio.plugin.exposure import BRIGHTEST, fit_checkpoint
 from ssa_nerfstudio.plugin.photo_formation import clean_image
 from ssa_nerfstudio.plugin.photo_losses import PhotoLosses
+from ssa_nerfstudio.plugin.photo_shading import of_checkpoint
 from ssa_nerfstudio.plugin.settings import ModelSettings
-from ssa_nerfstudio.plugin.shading import Shading, check_checkpoint
 from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
 from ssa_nerfstudio.plugin.training import nonfinite, seed_points
 from ssa_nerfstudio.plugin.training.densification import AdaptiveDensityControl, MarkovChainMonteCarlo, make_strategy
@@ -69,8 +69,6 @@ class SSASplatfactoModel(PhotoLosses):
         if points is not None and not self.config.random_init and len(points[1]):
             self.gauss_params["features_dc"] = Parameter(seed_points.color_parameters(points[1], self.config.sh_degree))
         self.artifacts = Artifacts()
-        self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
-        self.shading = Shading(self.num_train_data) if self.config.shading == "affine" else None
         self._draw = SplatRenderer(self.config.rasterizer)
         self._controls = ArtifactControls(lambda: self.artifacts)
         self.scene_scale = 1.0
@@ -135,10 +133,7 @@ class SSASplatfactoModel(PhotoLosses):
             nonfinite.clamp_scales(self.scales)
             for overlay in self.artifacts.learned():
                 overlay.clamp_logits()
-        if self.exposure is not None:
-            self.exposure.project()
-        if self.shading is not None:
-            self.shading.project()
+        self.project_photos()
         super().step_post_backward(step)
 
     def end_training(self, step: int) -> None:
@@ -169,12 +164,7 @@ class SSASplatfactoModel(PhotoLosses):
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         fit_checkpoint(self.exposure, dict, "exposure.")
-        if self.training:
-            check_checkpoint(self.shading, dict, "shading.")
-        else:  # what is rendered has the mean light
-            self.shading = None
-            for name in [name for name in dict if name.startswith("shading.")]:
-                del dict[name]
+        self.shading = of_checkpoint(self.shading, dict, "shading.", self.training)
         if self.training and self._near_plane_is_set:  # a resumed run has its own clearance
             dict["near_plane"] = self.near_plane
         dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored

@@ -16,7 +16,7 @@ from ssa_nerfstudio.overlay.compositing import clip_straight_through
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
-from ssa_nerfstudio.plugin.shading import Shading
+from ssa_nerfstudio.plugin.photo_shading import Shading
 
 
 def clean_image(color: Tensor, accumulation: Tensor, background: Tensor, white: float) -> Tensor:

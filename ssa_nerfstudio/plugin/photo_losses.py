@@ -17,8 +17,8 @@ from ssa_nerfstudio.overlay.sparsity import sparsity_loss, sparsity_weight
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
 from ssa_nerfstudio.plugin.photo_formation import clean_image, predicted_photo
+from ssa_nerfstudio.plugin.photo_shading import Shading
 from ssa_nerfstudio.plugin.settings import ModelSettings
-from ssa_nerfstudio.plugin.shading import Shading
 from ssa_nerfstudio.plugin.splat_rendering import LearnedRender
 
 
@@ -34,9 +34,17 @@ class PhotoLosses(SplatfactoModel):
     the sum of the losses is what is minimized, not a multiple of it."""
 
     def populate_modules(self) -> None:
-        """Build splatfacto's modules, and nothing that is recorded yet."""
+        """Build splatfacto's modules and what belongs to single photos, and nothing that is recorded yet."""
         super().populate_modules()
+        self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
+        self.shading = Shading(self.num_train_data) if self.config.shading == "affine" else None
         self._recorded = RecordedCalls(CapturedPrograms, of_sum=True)
+
+    def project_photos(self) -> None:
+        """Let the photos' exposures, and the light on each overlay, have the identity as their mean."""
+        for own in (self.exposure, self.shading):
+            if own is not None:
+                own.project()
 
     def get_gt_img(self, image: Tensor) -> Tensor:
         """Convert a photo to [0, 1], in one pass over uint8 instead of two.

@@ -31,13 +31,14 @@ from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
+from ssa_nerfstudio.plugin.photo_shading import started
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.densification import gaussian_budget
 from ssa_nerfstudio.plugin.training.seed_points import add_seeds, nearest_depth
 from ssa_nerfstudio.plugin.triton_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
-from ssa_nerfstudio.plugin.view_geometry import view_matrix
+from ssa_nerfstudio.plugin.view_geometry import extent, view_matrix
 
 _LOG = logging.getLogger(__name__)
 
@@ -83,7 +84,7 @@ class SSAPipeline(VanillaPipeline):
         if test_mode == "val":
             cameras = self.datamanager.train_dataset.cameras
             positions = cameras.camera_to_worlds[:, :3, 3]
-            self.model.set_scene_extent(_extent(positions))
+            self.model.set_scene_extent(extent(positions))
             self.model.start_outside_cameras(positions)
             self._examine_photos()
             # After the photos are decoded: a size that they do not have is the dataset's fault.
@@ -95,16 +96,18 @@ class SSAPipeline(VanillaPipeline):
 
     def _examine_photos(self) -> None:
         """All that reads the training photos before the first step."""
-        tell_of_fisheyes(self.datamanager.train_dataset.raw_cameras)
-        lenses = describe_lenses(self.datamanager.train_dataset.raw_cameras)
+        dataset, resumed = self.datamanager.train_dataset, self.config.artifacts_of is not None
+        tell_of_fisheyes(dataset.raw_cameras)
+        lenses = describe_lenses(dataset.raw_cameras)
         # Undistorts and crops the photos and rewrites the cameras: overlays and depths are of the undistorted frame.
         photos = self.datamanager.cached_train
-        if self.config.artifacts_of is None:
-            dataset = self.datamanager.train_dataset
-            check_masks(photos, group_cameras(dataset.cameras)[1], self.datamanager.photo_names(dataset))
+        names = self.datamanager.photo_names(dataset)
+        if not resumed:
+            check_masks(photos, group_cameras(dataset.cameras)[1], names)
         samples = self._start_exposure()
         self._set_overlays(photos, lenses)
-        self._start_shading(photos)
+        known = photos if not resumed and self.model.exposure is None else None
+        self.model.shading = started(self.model.shading, self.model.artifacts, names, known)
         self.sphere = self._shared_sphere()
         if self.model.exposure is not None and samples is not None and len(self.model.artifacts):
             by_photos = self.config.model.exposure_place == "auto"
@@ -158,16 +161,6 @@ class SSAPipeline(VanillaPipeline):
         if self.config.artifacts_of:
             return None  # of a resumed run
         return start_from_points(exposure, self.datamanager.cached_train, photos.cameras, self._points())
-
-    def _start_shading(self, photos: list[dict[str, Any]]) -> None:
-        model = self.model
-        if not model.artifacts.learned():
-            model.shading = None
-        if model.shading is None:
-            return
-        model.shading.assign(model.artifacts, self.datamanager.photo_names(self.datamanager.train_dataset))
-        if model.exposure is None and not self.config.artifacts_of:
-            model.shading.start_from(model.artifacts, photos)
 
     def _points(self) -> torch.Tensor | None:
         """Of the scene, [N, 3]."""
@@ -302,8 +295,3 @@ def check_data(config: SSAPipelineConfig, test_mode: Literal["test", "val", "inf
 def _source(config: SSAPipelineConfig) -> Path:
     data = config.datamanager.data or config.datamanager.dataparser.data
     return Path(data)
-
-
-def _extent(positions: torch.Tensor) -> float:
-    """Radius of the cameras around their center, times 1.1 (3DGS's `nerf_normalization`; at least 1e-6)."""
-    return max(1e-6, 1.1 * float((positions - positions.mean(dim=0)).norm(dim=1).max()))

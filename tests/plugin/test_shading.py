@@ -17,7 +17,7 @@ from ssa_nerfstudio.overlay.shading import light, shading_basis
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.photo_formation import predicted_photo
-from ssa_nerfstudio.plugin.shading import Shading
+from ssa_nerfstudio.plugin.photo_shading import Shading
 
 HEIGHT, WIDTH, VIEWS = 40, 60, 9
 

@@ -92,17 +92,44 @@ class Shading(nn.Module):
         self.photos = list(state["photos"])
 
 
-def check_checkpoint(shading: Shading | None, state: dict[str, Any], prefix: str) -> None:
-    """Refuse a checkpoint that this training cannot go on from.
+def started(
+    shading: Shading | None, artifacts: Artifacts, photos: list[str], cache: list[dict[str, Any]] | None
+) -> Shading | None:
+    """The shading of a model whose overlays are there.
 
     Args:
         shading: the model's.
-        state: the model's state dict.
+        artifacts: its overlays.
+        photos: the training photos' paths relative to the dataset.
+        cache: the datamanager's undistorted photos, which it starts from; None: from the same light in all photos.
+
+    Returns:
+        None where no overlay is learned.
+    """
+    if shading is None or not artifacts.learned():
+        return None
+    shading.assign(artifacts, photos)
+    if cache is not None:
+        shading.start_from(artifacts, cache)
+    return shading
+
+
+def of_checkpoint(shading: Shading | None, state: dict[str, Any], prefix: str, training: bool) -> Shading | None:
+    """The shading of a model that loads a checkpoint: what is only rendered has the mean light, and needs none.
+
+    Args:
+        shading: the model's.
+        state: the model's state dict, from which entries are dropped that are not needed.
         prefix: of the shading's entries in it.
+        training: whether the model goes on from the checkpoint.
 
     Raises:
         InputError: one of the two has no shading, or the checkpoint has that of other photos.
     """
+    if not training:
+        for name in [name for name in state if name.startswith(prefix)]:
+            del state[name]
+        return None
     saved = state.get(f"{prefix}coefficients")
     if (saved is None) != (shading is None):
         there, setting = ("no", "off") if saved is None else ("a", "affine")
@@ -110,14 +137,13 @@ def check_checkpoint(shading: Shading | None, state: dict[str, Any], prefix: str
             f"the checkpoint has {there} shading of the artifact, this run's setting is another",
             f"resume with --pipeline.model.shading {setting}",
         )
-    if shading is None or saved is None:
-        return
-    if state[f"{prefix}_extra_state"]["photos"] != shading.photos:
+    if shading is not None and saved is not None and state[f"{prefix}_extra_state"]["photos"] != shading.photos:
         raise InputError(
             f"the checkpoint has the shading of {len(saved)} photos, and this run's {len(shading.photos)} are not "
             "the same in the same order",
             "resume with the photos it was trained with",
         )
+    return shading
 
 
 def _basis(overlay: ScreenSpaceOverlay, reduction: int) -> Tensor:
