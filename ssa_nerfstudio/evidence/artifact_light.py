@@ -15,7 +15,7 @@ from ssa_nerfstudio.overlay.shading import COEFFICIENTS
 MIN_OPACITY = 0.5
 """Of the pixels that count: the artifact's light is at least as much as the scene's."""
 MAX_COEFFICIENT = 1.0
-"""Of the result: a factor of 2.7 in brightness; beyond it, something else is there."""
+"""Of a coefficient: a factor of 2.7 in the brightness of what is opaque; beyond it, something else is there."""
 
 
 @torch.no_grad()
@@ -46,7 +46,8 @@ def artifact_light(images: Sequence[Tensor], masks: Sequence[Tensor | None], bas
     shown = torch.stack([_at(image[..., :3], counts, reduction) / FULL_SCALE.get(image.dtype, 1.0) for image in images])
     weights = torch.stack([_weight(mask, counts, reduction) for mask in masks])
     mean = (weights * shown).sum(dim=0) / weights.sum(dim=0).clamp_min(1)
-    products = torch.einsum("vn,nci,ncj->vij", weights[..., 0].double(), terms, terms)
+    squares = torch.einsum("nci,ncj->nij", terms, terms)  # once: for each photo it would be large
+    products = torch.einsum("vn,nij->vij", weights[..., 0].double(), squares)
     ridge = 1e-6 * products.diagonal(dim1=1, dim2=2).amax(dim=1).clamp_min(1e-12)
     products += ridge[:, None, None] * torch.eye(COEFFICIENTS, dtype=products.dtype, device=products.device)
     sums = torch.einsum("vnc,nci->vi", (weights * (shown - mean)).double(), terms)

@@ -1,4 +1,5 @@
-"""The light on an artifact: brightness and tint that change linearly over it, as a factor of its own light B."""
+"""The light on an artifact, as a factor of its own light B: its logarithm changes linearly over the artifact, its tint
+does not."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ import torch
 from torch import Tensor
 
 COEFFICIENTS = 5
-"""Logarithms of the gains of red, green and blue in the artifact's middle, and their change to the right and downwards,
-a standard deviation of its extent."""
+"""Number of coefficients: logarithms of the gains of red, green and blue in the middle of an opaque artifact, and their
+change to the right and downwards per standard deviation of its extent. Less where less is opaque."""
 _HALF_WIDTH = math.sqrt(3)
 """Of an artifact of constant opacity, standard deviations of its extent. The light stays the same beyond."""
 
@@ -17,7 +18,7 @@ _HALF_WIDTH = math.sqrt(3)
 def shading_basis(opacity: Tensor) -> Tensor:
     """What the coefficients of a photo are multiplied by, [h, w, 3]: the opacity, and it times both coordinates.
 
-    So nothing changes where nothing is in front of the scene.
+    So the light changes least where the estimate of the opacity is mostly noise.
 
     Args:
         opacity: of the artifact [h, w, 1] in [0, 1].

@@ -13,11 +13,12 @@ from torch import Tensor, nn
 from torch.nn import Parameter
 
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.artifact_light import artifact_light
+from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, artifact_light
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import to_training_scale
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS, light, shading_basis
 from ssa_nerfstudio.plugin.artifacts import Artifacts
+from ssa_nerfstudio.plugin.decisions import tell
 
 
 class Shading(nn.Module):
@@ -71,17 +72,20 @@ class Shading(nn.Module):
         """The factor of B in a training photo, [H // reduction, W // reduction, 3], above 0."""
         key = self._group_of_view[view], reduction
         if key not in self._bases:
+            # Of one resolution: that of a training only rises.
+            self._bases = {known: basis for known, basis in self._bases.items() if known[1] == reduction}
             self._bases[key] = _basis(overlay, reduction)
         return light(self._bases[key], self.coefficients[view])
 
     @torch.no_grad()
     def project(self) -> None:
-        """Subtract the means over the photos of each overlay, so that the overlay has their mean light."""
+        """Subtract the means over the photos of each overlay, so that the overlay has their mean light, and bound all."""
         self._groups = self._groups.to(self.coefficients.device)
         sums = self.coefficients.new_zeros(max(self._group_of_view) + 1, COEFFICIENTS + 1)
         ones = torch.ones_like(self.coefficients[:, :1])
         sums.index_add_(0, self._groups, torch.cat([self.coefficients, ones], dim=1))
         self.coefficients.sub_((sums[:, :-1] / sums[:, -1:].clamp_min(1))[self._groups])
+        self.coefficients.clamp_(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
     def get_extra_state(self) -> dict[str, Any]:
         """What a checkpoint holds beside the coefficients."""
@@ -93,7 +97,11 @@ class Shading(nn.Module):
 
 
 def started(
-    shading: Shading | None, artifacts: Artifacts, photos: list[str], cache: list[dict[str, Any]] | None
+    shading: Shading | None,
+    artifacts: Artifacts,
+    photos: list[str],
+    cache: list[dict[str, Any]] | None,
+    resumed: bool,
 ) -> Shading | None:
     """The shading of a model whose overlays are there.
 
@@ -102,11 +110,15 @@ def started(
         artifacts: its overlays.
         photos: the training photos' paths relative to the dataset.
         cache: the datamanager's undistorted photos, which it starts from; None: from the same light in all photos.
+        resumed: a checkpoint, which is loaded later, holds the overlays and their light.
 
     Returns:
-        None where no overlay is learned.
+        None where no overlay is learned, or none hides anything as it starts, so that a light would change nothing.
     """
     if shading is None or not artifacts.learned():
+        return None
+    if not resumed and not any((overlay.evidence < 1).any() for overlay in artifacts.learned()):
+        tell("The artifact hides nothing as the training starts: it has the same light in all photos.")
         return None
     shading.assign(artifacts, photos)
     if cache is not None:

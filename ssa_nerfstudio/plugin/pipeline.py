@@ -107,7 +107,7 @@ class SSAPipeline(VanillaPipeline):
         samples = self._start_exposure()
         self._set_overlays(photos, lenses)
         known = photos if not resumed and self.model.exposure is None else None
-        self.model.shading = started(self.model.shading, self.model.artifacts, names, known)
+        self.model.shading = started(self.model.shading, self.model.artifacts, names, known, resumed)
         self.sphere = self._shared_sphere()
         if self.model.exposure is not None and samples is not None and len(self.model.artifacts):
             by_photos = self.config.model.exposure_place == "auto"

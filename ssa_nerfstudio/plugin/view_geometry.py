@@ -62,5 +62,5 @@ def prepare(cameras: Cameras, reductions: tuple[int, ...]) -> list[Cameras]:
 
 
 def extent(positions: Tensor) -> float:
-    """Radius of cameras at positions [V, 3] around their center, times 1.1 (3DGS: `nerf_normalization`); at least 1e-6."""
+    """Radius of cameras at positions [V, 3] around their center, times 1.1 (3DGS: `nerf_normalization`), not 0."""
     return max(1e-6, 1.1 * float((positions - positions.mean(dim=0)).norm(dim=1).max()))
