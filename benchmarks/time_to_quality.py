@@ -41,8 +41,8 @@ class Command:
     data: Path
     """The same dataset with an artifact in front of its training photos, and clean test photos."""
     output: Annotated[Path, file_to_write()]
-    """File to which every training is added, as a line of JSON. What it has, by the name of the dataset's folder, is not
-    trained again: choose another for another machine or revision."""
+    """File to which every training is added, as a line of JSON. What it has, by the name of the dataset's folder, is
+    not trained again: choose another for another machine or revision."""
     methods: tuple[Method, ...] = ("ssa-splatfacto-fast", "ssa-splatfacto")
     """Methods that train behind the artifact, each with as many steps as it has."""
     steps: Count = 30_000

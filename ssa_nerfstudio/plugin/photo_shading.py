@@ -79,7 +79,7 @@ class Shading(nn.Module):
 
     @torch.no_grad()
     def project(self) -> None:
-        """Subtract the means over the photos of each overlay, so that the overlay has their mean light, and bound all."""
+        """Subtract the means over the photos of each overlay, which so has their mean light; then bound all."""
         self._groups = self._groups.to(self.coefficients.device)
         sums = self.coefficients.new_zeros(max(self._group_of_view) + 1, COEFFICIENTS + 1)
         ones = torch.ones_like(self.coefficients[:, :1])
