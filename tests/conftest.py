@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import shutil
 import signal
 import subprocess
@@ -55,6 +56,26 @@ def configure_training() -> Callable:
     from ssa_nerfstudio.experiments.runs.run_configuration import configure
 
     return configure
+
+
+@pytest.fixture(scope="session")
+def train_resumable(configure_training, tmp_path_factory: pytest.TempPathFactory) -> Callable:
+    """Train unscaled and seeded, given dataset, steps, settings of the model, and checkpoints to go on from."""
+
+    def train(data: Path, steps: int, model: dict, load_dir: Path | None = None):
+        config = configure_training("ssa-splatfacto", data, tmp_path_factory.mktemp("run"), steps, model)
+        config.load_dir, config.vis = load_dir, "tensorboard"
+        config.scale_schedules = False
+        config.set_timestamp()
+        config.save_config()
+        random.seed(0)
+        torch.manual_seed(0)
+        trainer = config.setup(local_rank=0, world_size=1)
+        trainer.setup()
+        trainer.train()
+        return trainer
+
+    return train
 
 
 @pytest.fixture(scope="session")

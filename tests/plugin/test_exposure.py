@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import shutil
 from pathlib import Path
 from typing import Any
@@ -174,22 +173,12 @@ def varying_scene(tiny_scene, tmp_path_factory) -> tuple[Path, np.ndarray]:
 
 
 @pytest.fixture(scope="module")
-def train(varying_scene, configure_training, tmp_path_factory):
+def train(varying_scene, train_resumable):
     """Train on the varying scene, given settings of the model, steps, and a folder of checkpoints to resume from."""
 
     def run(steps: int = 40, load_dir: Path | None = None, **model):
         model = {"overlay": "on", "num_downscales": 0, "exposure": "affine", **model}
-        output = tmp_path_factory.mktemp("run")
-        config = configure_training("ssa-splatfacto", varying_scene[0], output, steps, model)
-        config.load_dir, config.vis = load_dir, "tensorboard"
-        config.scale_schedules = False
-        config.set_timestamp()
-        random.seed(0)
-        torch.manual_seed(0)
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        trainer.train()
-        return trainer
+        return train_resumable(varying_scene[0], steps, model, load_dir)
 
     return run
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 
 import numpy as np
@@ -159,22 +158,12 @@ def varying_scene(write_built_in_scene, composited_layers, tmp_path_factory) -> 
 
 
 @pytest.fixture(scope="module")
-def train(varying_scene, configure_training, tmp_path_factory):
+def train(varying_scene, train_resumable):
     """Train on the varying scene, given settings of the model, steps, and a folder of checkpoints to resume from."""
 
     def run(steps: int = 30, load_dir: Path | None = None, **model):
         model = {"overlay": "on", "num_downscales": 0, "shading": "affine", **model}
-        config = configure_training("ssa-splatfacto", varying_scene[0], tmp_path_factory.mktemp("run"), steps, model)
-        config.load_dir, config.vis = load_dir, "tensorboard"
-        config.scale_schedules = False
-        config.set_timestamp()
-        config.save_config()
-        random.seed(0)
-        torch.manual_seed(0)
-        trainer = config.setup(local_rank=0, world_size=1)
-        trainer.setup()
-        trainer.train()
-        return trainer
+        return train_resumable(varying_scene[0], steps, model, load_dir)
 
     return run
 
