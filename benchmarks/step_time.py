@@ -92,19 +92,14 @@ class Command:
 
     def _config(self, output: Path) -> TrainerConfig:
         from nerfstudio.configs.method_configs import all_methods
-        from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
 
+        from ssa_nerfstudio.experiments.runs.run_configuration import leave_unattended
         from ssa_nerfstudio.plugin.methods import METHODS
 
         config = copy.deepcopy((all_methods | METHODS)[self.method])
-        config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", LAST + 1, 10 * LAST
-        config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
-        config.logging.local_writer.enable = False
-        config.output_dir = output
         data = self.data if self.enlarge == 1 else _enlarged(self.data, self.enlarge, output / "photos")
-        config.data = config.pipeline.datamanager.data = data
-        parser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
-        config.pipeline.datamanager.dataparser = parser  # pyright: ignore[reportAttributeAccessIssue]
+        leave_unattended(config, data, output, LAST + 1)
+        config.steps_per_save = 10 * LAST  # --alternate trains longer
         model = config.pipeline.model
         model.num_downscales = 0  # pyright: ignore[reportAttributeAccessIssue]
         if self.method != "splatfacto":

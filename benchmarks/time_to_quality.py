@@ -135,16 +135,12 @@ def _splatfacto(method: str, data: Path, folder: Path, steps: int, seed: int) ->
 def _configuration(method: str, data: Path, folder: Path, steps: int, seed: int) -> TrainerConfig:
     """nerfstudio's own settings, without a viewer and without evaluation in between."""
     from nerfstudio.configs.method_configs import all_methods
-    from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+
+    from ssa_nerfstudio.experiments.runs.run_configuration import leave_unattended
 
     config = copy.deepcopy(all_methods[method])
-    config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", steps, steps + 1
-    config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
-    config.logging.local_writer.enable = False
-    config.output_dir, config.data, config.pipeline.datamanager.data = folder, data, data
+    leave_unattended(config, data, folder, steps)
     config.machine.seed += seed
-    parser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
-    config.pipeline.datamanager.dataparser = parser  # pyright: ignore[reportAttributeAccessIssue]
     return config
 
 

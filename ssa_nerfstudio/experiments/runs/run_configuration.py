@@ -11,6 +11,7 @@ from typing import Any, get_type_hints
 
 import yaml
 from nerfstudio.data.dataparsers.nerfstudio_dataparser import NerfstudioDataParserConfig
+from nerfstudio.engine.trainer import TrainerConfig
 
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.experiments.configuration import build
@@ -45,16 +46,11 @@ def configure(
         InputError: the model has no such setting, or not with such a value.
     """
     config = copy.deepcopy(METHODS[method])
-    config.vis = "tensorboard"
-    config.logging.local_writer.enable = False
-    config.data, config.output_dir, config.max_num_iterations = data, output, steps
-    config.steps_per_save = steps + 1
-    config.steps_per_eval_image = 0
+    leave_unattended(config, data, output, steps)
     config.machine.seed += seed
     datamanager = config.pipeline.datamanager
-    datamanager.data, datamanager.camera_res_scale_factor = data, scale_factor
+    datamanager.camera_res_scale_factor = scale_factor
     datamanager.train_cameras_sampling_seed += seed
-    datamanager.dataparser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
     adapt(config)
     settings = {each.name for each in dataclasses.fields(config.pipeline.model)} - {"_target"}
     kinds: dict[str, Any] = get_type_hints(type(config.pipeline.model), include_extras=True)
@@ -65,6 +61,21 @@ def configure(
         built = dataclasses.is_dataclass(value)  # by a caller in Python; files hold keys and values
         setattr(config.pipeline.model, name, value if built else build(kinds[name], value, f"setting {name!r}"))
     return config
+
+
+def leave_unattended(config: TrainerConfig, data: Path, output: Path, steps: int) -> None:
+    """Let a run need no one: no viewer, no evaluation in between, one checkpoint at the end.
+
+    Args:
+        config: of one of this plugin's methods, or of nerfstudio's own; changed in place.
+        data, output, steps: as for `configure`.
+    """
+    config.vis, config.max_num_iterations, config.steps_per_save = "tensorboard", steps, steps + 1
+    config.steps_per_eval_image = config.steps_per_eval_batch = config.steps_per_eval_all_images = 0
+    config.logging.local_writer.enable = False
+    config.output_dir, config.data, config.pipeline.datamanager.data = output, data, data
+    parser = NerfstudioDataParserConfig(load_3D_points=True, eval_mode="interval", eval_interval=8)
+    config.pipeline.datamanager.dataparser = parser  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def model_settings(settings: tuple[str, ...]) -> dict[str, Any]:
