@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
+from ssa_nerfstudio.evidence.layer_estimate import PRIOR_SCALE
 from ssa_nerfstudio.evidence.point_samples import working_reduction
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS
@@ -16,52 +18,104 @@ MIN_OPACITY = 0.5
 """Of the pixels that count: the artifact's light is at least as much as the scene's."""
 MAX_COEFFICIENT = 1.0
 """Of a coefficient: a factor of 2.7 in the brightness of what is opaque; beyond it, something else is there."""
+MIN_EXPLAINED = 1 / 3
+"""Share of what the scene does not explain from which on the light changes: it explains half as much as it leaves."""
+
+
+@dataclass(frozen=True)
+class ArtifactLight:
+    """The light on an artifact in each of V photos."""
+
+    coefficients: Tensor
+    """[V, COEFFICIENTS], of mean 0 over the photos (`overlay.shading`); 0 where no pixel is hidden."""
+    explained: float
+    """How much of the photos' differences it explains, of those that the scene does not as it comes through, in [0, 1];
+    0 where no pixel is hidden."""
+
+    @property
+    def changes(self) -> bool:
+        """Whether the light is not the same in all photos."""
+        return self.explained > MIN_EXPLAINED
 
 
 @torch.no_grad()
-def artifact_light(images: Sequence[Tensor], masks: Sequence[Tensor | None], basis: Tensor, addition: Tensor) -> Tensor:
-    """Fit the coefficients of each photo's shading.
+def artifact_light(
+    images: Sequence[Tensor], masks: Sequence[Tensor | None], basis: Tensor, layers: tuple[Tensor, Tensor]
+) -> ArtifactLight:
+    """Fit the coefficients of each photo's shading, and judge whether there is any.
 
     By least squares, I_i - mean(I) = B (basis coefficients_i), the linear part of the light. What the scene changes
-    where it comes through is taken for light, too, so this is a start and no more.
+    where it comes through is taken for light, too, so these are a start and no more.
+
+    Light is judged beside a scene of as many coefficients, T (own gains and slopes of the photo): the share of the
+    squares that are left without light, and are not with it. To them are added those of a scene that comes through by
+    PRIOR_SCALE more than T says, because T is not known better.
 
     Args:
         images: photos behind the same artifact, [H, W, 3 or 4] of one size.
         masks: of each photo [H, W, 1], 0 where it does not count; None for none.
         basis: [H, W, 3] (`overlay.shading.shading_basis`).
-        addition: B of the artifact [H, W, 3] in the mean light.
-
-    Returns:
-        [V, COEFFICIENTS] on the device of the basis, of mean 0 over the photos; 0 where no pixel is hidden.
+        layers: of the artifact in the mean light, T [H, W, 1 or 3] and B [H, W, 3].
     """
     reduction = working_reduction(*basis.shape[:2])
-    basis, addition = reduced(basis, reduction), reduced(addition, reduction)
+    basis = reduced(basis, reduction)
+    transmittance, addition = (reduced(layer, reduction) for layer in layers)
     counts = basis[..., 0] > MIN_OPACITY
     if not counts.any():
-        return basis.new_zeros(len(images), COEFFICIENTS)
+        return ArtifactLight(basis.new_zeros(len(images), COEFFICIENTS), 0.0)
     own, slopes = basis[counts].split((1, 2), dim=-1)
-    light = addition[counts]
-    # [N, 3 channels, 5]: a gain for each channel, slopes for all.
-    terms = torch.cat([torch.diag_embed(light * own), light[..., None] * slopes[:, None]], dim=-1).double()
-    shown = torch.stack([_at(image[..., :3], counts, reduction) / FULL_SCALE.get(image.dtype, 1.0) for image in images])
+    through = transmittance[counts].mean(dim=-1, keepdim=True).expand(-1, 3)
+    # [N, 3 channels, 5] each: a gain for each channel, slopes for all.
+    of_light = _terms(addition[counts] * own, addition[counts], slopes)
+    of_scene = _terms(through, through, slopes / own)
+    terms = torch.cat([of_light, of_scene], dim=-1).double()
+    seen = [reduced(image[..., :3].float(), reduction) / FULL_SCALE.get(image.dtype, 1.0) for image in images]
+    shown = torch.stack([photo.to(basis.device)[counts] for photo in seen])
     weights = torch.stack([_weight(mask, counts, reduction) for mask in masks])
     mean = (weights * shown).sum(dim=0) / weights.sum(dim=0).clamp_min(1)
+    change = (weights * (shown - mean)).double()
     squares = torch.einsum("nci,ncj->nij", terms, terms)  # once: for each photo it would be large
-    products = torch.einsum("vn,nij->vij", weights[..., 0].double(), squares)
+    products = torch.einsum("vn,nij->vij", weights[..., 0].double(), squares).cpu()
+    sums = torch.einsum("vnc,nci->vi", change, terms).cpu()
+    light, scene, both = slice(0, COEFFICIENTS), slice(COEFFICIENTS, None), slice(None)
+    by_scene, by_both = (float((sums[:, part] * _solved(products, sums, part)).sum()) for part in (scene, both))
+    unknown = PRIOR_SCALE**2 * _variance([photo[~counts.to(photo.device)] for photo in seen])
+    left = float(change.square().sum()) - by_scene + 3 * float(weights.sum()) * unknown
+    found = _solved(products, sums, light).clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
+    explained = min(max((by_both - by_scene) / max(left, 1e-12), 0.0), 1.0)
+    return ArtifactLight(found - found.mean(dim=0), explained)
+
+
+def _terms(of_gains: Tensor, of_slopes: Tensor, slopes: Tensor) -> Tensor:
+    """[N, 3, 5]: what a photo's coefficients are multiplied by at a pixel and in a channel.
+
+    Args:
+        of_gains, of_slopes: factors of both [N, 3].
+        slopes: [N, 2].
+    """
+    return torch.cat([torch.diag_embed(of_gains), of_slopes[..., None] * slopes[:, None]], dim=-1)
+
+
+def _solved(products: Tensor, sums: Tensor, part: slice) -> Tensor:
+    """Coefficients [V, K] of a part of the terms alone."""
+    products = products[:, part, part]
     ridge = 1e-6 * products.diagonal(dim1=1, dim2=2).amax(dim=1).clamp_min(1e-12)
-    products += ridge[:, None, None] * torch.eye(COEFFICIENTS, dtype=products.dtype, device=products.device)
-    sums = torch.einsum("vnc,nci->vi", (weights * (shown - mean)).double(), terms)
-    found = torch.linalg.solve(products.cpu(), sums.cpu()).clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
-    return found - found.mean(dim=0)
+    identity = torch.eye(products.shape[-1], dtype=products.dtype)
+    return torch.linalg.solve(products + ridge[:, None, None] * identity, sums[:, part])
 
 
-def _at(image: Tensor, counts: Tensor, reduction: int) -> Tensor:
-    """Pixels [N, C] of an image [H, W, C] that count, on the device of `counts` [h, w]."""
-    return reduced(image.float(), reduction).to(counts.device)[counts]
+def _variance(photos: list[Tensor]) -> float:
+    """Mean variance over photos [N, 3] of their values; 0 where N is."""
+    mean, square = torch.zeros_like(photos[0]), torch.zeros_like(photos[0])
+    for photo in photos:
+        mean += photo / len(photos)
+        square += photo.square() / len(photos)
+    return float((square - mean.square()).mean()) if mean.numel() else 0.0
 
 
 def _weight(mask: Tensor | None, counts: Tensor, reduction: int) -> Tensor:
     """[N, 1]: 1 where a photo counts, elsewhere 0."""
     if mask is None:
         return torch.ones(int(counts.sum()), 1, device=counts.device)
-    return (_at((mask != 0).reshape(*mask.shape[:2], 1), counts, reduction) == 1).float()
+    whole = reduced((mask != 0).reshape(*mask.shape[:2], 1).float(), reduction)
+    return (whole.to(counts.device)[counts] == 1).float()

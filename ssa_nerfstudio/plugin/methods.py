@@ -114,6 +114,7 @@ ssa_splatfacto_paper = MethodSpecification(
             overlay_start="statistics",
             overlay_intervals="off",
             overlay_film="kept",
+            shading="off",
             sparsity="l1",
             sparsity_weight=0.05,
             background_color="black",

@@ -23,7 +23,6 @@ from ssa_nerfstudio.plugin.evaluation import step_metrics, view_images, view_met
 from ssa_nerfstudio.plugin.exposure import BRIGHTEST, fit_checkpoint
 from ssa_nerfstudio.plugin.photo_formation import clean_image
 from ssa_nerfstudio.plugin.photo_losses import PhotoLosses
-from ssa_nerfstudio.plugin.photo_shading import of_checkpoint
 from ssa_nerfstudio.plugin.settings import ModelSettings
 from ssa_nerfstudio.plugin.splat_rendering import SplatRenderer
 from ssa_nerfstudio.plugin.training import nonfinite, seed_points
@@ -140,9 +139,9 @@ class SSASplatfactoModel(PhotoLosses):
         """After the last step: the scene gets the brightness of the photos' clearest pixels, and its backdrop.
 
         The former not where some photos have no overlay, which fix the brightness, nor where something else stands
-        between the scene and a photo, as exposure or a bilateral grid does, or the overlay's light varies.
+        between the scene and a photo, as exposure or a bilateral grid does.
         """
-        alone = self.exposure is None and self.shading is None and not self.config.use_bilateral_grid
+        alone = self.exposure is None and not self.config.use_bilateral_grid
         learned = self.artifacts.learned()
         if self.config.overlay_film != "kept" and alone and learned and not len(self.artifacts.bare_keys):
             clear_the_clearest(learned, self.features_dc.data, self.features_rest.data)
@@ -164,7 +163,8 @@ class SSASplatfactoModel(PhotoLosses):
             parameter.data = parameter.data.new_zeros((n, *parameter.shape[1:]))
         self.artifacts.allocate(dict, "artifacts.", wanted=not self.training or self.config.overlay != "off")
         fit_checkpoint(self.exposure, dict, "exposure.")
-        self.shading = of_checkpoint(self.shading, dict, "shading.", self.training)
+        for name in [name for name in dict if self.shading is None and name.startswith("shading.")]:
+            del dict[name]  # what is only rendered has the mean light
         if self.training and self._near_plane_is_set:  # a resumed run has its own clearance
             dict["near_plane"] = self.near_plane
         dict.setdefault("near_plane", torch.tensor(NEAR_PLANE))  # checkpoints from before it was stored

@@ -16,7 +16,6 @@ from ssa_nerfstudio.overlay.compositing import clip_straight_through
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.exposure import Exposure
-from ssa_nerfstudio.plugin.photo_shading import Shading
 
 
 def clean_image(color: Tensor, accumulation: Tensor, background: Tensor, white: float) -> Tensor:
@@ -39,11 +38,11 @@ def predicted_photo(
     view: int | None,
     reduction: int,
     ignore_background: bool,
-    shading: Shading | None = None,
+    light: Tensor | None = None,
 ) -> Tensor | None:
     """Predict a training photo, [H // reduction, W // reduction, 3].
 
-    With T and B of the overlay, which shading multiplies by the photo's light, and E of the exposure: E(T C + B), or
+    With T and B of the overlay, B times the photo's light, and E of the exposure: E(T C + B), or
     T E(C) + B where exposure acts on the scene.
 
     Args:
@@ -53,7 +52,7 @@ def predicted_photo(
         view: the training view; None: the camera is none.
         reduction: factor by which training images are reduced.
         ignore_background: see `compositing.composite_over_splats`.
-        shading: of the learned overlays; None where the light on them is the same in all photos.
+        light: factor of B in this photo, [H // reduction, W // reduction, 3]; None: 1.
 
     Returns:
         None where the photo is the clean render.
@@ -69,10 +68,10 @@ def predicted_photo(
         # Where nothing is drawn, the exposed render shows the exposed background.
         clean, background, exposed = exposed.expose(clean), exposed.expose(background), None
     behind = (drawn["accumulation"], background) if ignore_background else None
-    if shading is not None and isinstance(overlay, ScreenSpaceOverlay):
-        photo = overlay.composite(clean, reduction, behind, shading.of_view(view, overlay, reduction))
+    if light is not None and isinstance(overlay, ScreenSpaceOverlay):
+        photo = overlay.composite(clean, reduction, behind, light)
     else:
         photo = overlay.composite(clean, reduction, behind)
     if exposed is not None:
         return exposed.expose(photo)
-    return clip_straight_through(photo) if artifacts.exceed_white or shading is not None else photo
+    return clip_straight_through(photo) if artifacts.exceed_white or light is not None else photo

@@ -37,7 +37,7 @@ class PhotoLosses(SplatfactoModel):
         """Build splatfacto's modules and what belongs to single photos, and nothing that is recorded yet."""
         super().populate_modules()
         self.exposure = Exposure(self.num_train_data) if self.config.exposure == "affine" else None
-        self.shading = Shading(self.num_train_data) if self.config.shading == "affine" else None
+        self.shading = None
         self._recorded = RecordedCalls(CapturedPrograms, of_sum=True)
 
     def project_photos(self) -> None:
@@ -85,24 +85,28 @@ class PhotoLosses(SplatfactoModel):
         """
         render: LearnedRender = drawn.pop("render")
         photo = {name: batch[name].to(self.device) for name in ("image", "mask") if name in batch}
+        view = drawn["view"] if len(self.artifacts) else None
+        coefficients = None if view is None or self.shading is None else self.shading.of_view(view)
+        own = [] if coefficients is None else [coefficients.detach().requires_grad_()]
 
         def compute(image: Tensor, alpha: Tensor, background: Tensor, *others: Tensor) -> tuple[Tensor, ...]:
             color, accumulation = image.squeeze(0), alpha.squeeze(0)
             rgb = clean_image(color, accumulation, background, 1.0)
             shown = {"rgb": rgb, "accumulation": accumulation, "background": background}
-            with parameters_replaced(self.artifacts, others[len(photo) :]):
-                shown = self._with_photo(shown, drawn["view"])
+            with parameters_replaced(self.artifacts, others[len(photo) + len(own) :]):
+                shown = self._with_photo(shown, drawn["view"], others[len(photo)] if own else None)
                 losses = self._photo_losses(shown, dict(zip(photo, others)))  # noqa: B905
             pictures = (shown[name].detach() for name in ("rgb", "composite") if name in shown)
             return *losses.values(), *pictures
 
-        view = drawn["view"] if len(self.artifacts) else None
         kind = None if view is None else self.artifacts.group_of_view(view), tuple(photo)
         parameters, reduction = list(self.artifacts.parameters()), self._get_downscale_factor()
-        given = [render.image, render.alpha, drawn["background"], *photo.values()]
+        given = [render.image, render.alpha, drawn["background"], *photo.values(), *own]
         evaluated = self._recorded(compute, given, parameters, kind, reduction)
-        of_image, of_alpha, *_ = evaluated.backpropagate()
+        of_image, of_alpha, *_, last = evaluated.backpropagate()
         render.backpropagate(of_image, of_alpha)
+        if self.shading is not None and view is not None and own and last is not None:
+            self.shading.add_gradient(view, last)
         names = ["main_loss", *["sparsity"] * self._sparsity_counts(), "rgb", "composite"]
         found = dict(zip(names, evaluated.values))  # noqa: B905 - there may be no composite
         drawn.update({name: found.pop(name) for name in names[-2:] if name in found})
@@ -121,10 +125,24 @@ class PhotoLosses(SplatfactoModel):
         """Weight [H, W, 1] of every pixel in the photometric loss: the dataset's mask, None where there is none."""
         return self._downscale_if_required(batch["mask"].float()).to(self.device) if "mask" in batch else None
 
-    def _with_photo(self, drawn: dict[str, Any], view: int | None) -> dict[str, Any]:
-        """What is drawn for a training view, and `composite` where the photo is predicted as another image."""
-        reduction, ignored = self._get_downscale_factor(), self.config.ignore_background
-        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored, self.shading)
+    def _with_photo(
+        self, drawn: dict[str, Any], view: int | None, coefficients: Tensor | None = None
+    ) -> dict[str, Any]:
+        """What is drawn for a training view, and `composite` where the photo is predicted as another image.
+
+        Args:
+            drawn: the model's outputs.
+            view: the training view; None: the camera is none.
+            coefficients: of the photo's shading, where it is learned; None: the model's.
+        """
+        reduction, light = self._get_downscale_factor(), None
+        if self.shading is not None and view is not None:
+            own, overlay = coefficients, self.artifacts.of_view(view)
+            own = self.shading.of_view(view) if own is None else own
+            if own is not None and isinstance(overlay, ScreenSpaceOverlay):
+                light = self.shading.light(view, own, overlay, reduction)
+        ignored = self.config.ignore_background
+        photo = predicted_photo(drawn, self.artifacts, self.exposure, view, reduction, ignored, light)
         return drawn if photo is None else {**drawn, "composite": photo}
 
     def _losses_are_recorded(self, with_depth: bool) -> bool:
@@ -133,5 +151,5 @@ class PhotoLosses(SplatfactoModel):
 
     def _can_be_recorded(self, with_depth: bool) -> bool:
         """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
-        of_views = self.config.use_bilateral_grid or self.exposure is not None or self.shading is not None
+        of_views = self.config.use_bilateral_grid or self.exposure is not None
         return self.training and self.recordable and torch.is_grad_enabled() and not (with_depth or of_views)

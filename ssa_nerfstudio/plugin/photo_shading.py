@@ -6,85 +6,86 @@ for all photos leaves that unexplained, and the scene learns it where it comes t
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import Parameter
 
+from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, artifact_light
+from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, ArtifactLight, artifact_light
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import to_training_scale
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS, light, shading_basis
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.decisions import tell
+from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
+
+Setting = Literal["auto", "off", "affine"]
+"""Which photos have a light of their own: those of an artifact on which it changes, none, or all."""
 
 
 class Shading(nn.Module):
-    """The light on the artifact in all training photos. Any other photo has the mean light."""
+    """The light on the artifact in training photos that have one of their own. Any other photo has the mean light."""
 
     coefficients: Parameter
-    """[V, 5], see `overlay.shading`. Their means over the photos of an overlay are 0."""
+    """[R, 5] of those photos, see `overlay.shading`. Their means over the photos of an overlay are 0."""
 
-    def __init__(self, photos: int) -> None:
-        """Start from the same light in all photos.
+    def __init__(self, views: dict[int, int], names: list[str], coefficients: Tensor) -> None:
+        """Start from known light.
 
         Args:
-            photos: their number V.
+            views: training view of each of the R photos, and the group of its overlay.
+            names: the photos' paths relative to the dataset, of all training views.
+            coefficients: [R, 5], on the model's device.
         """
         super().__init__()
-        self.coefficients = Parameter(torch.zeros(photos, COEFFICIENTS))
-        self.photos: list[str] = []
+        self.coefficients = Parameter(coefficients)
+        self.photos = [names[view] for view in views]
         """The photos' paths relative to the dataset."""
-        self._group_of_view = [0] * photos
-        self._groups = torch.zeros(photos, dtype=torch.long)  # on the device of the coefficients from `project` on
+        self._row_of_view = {view: row for row, view in enumerate(views)}
+        self._groups = torch.tensor(list(views.values()), device=coefficients.device)
+        self._photos_of_groups = torch.bincount(self._groups).clamp_min(1)[:, None]
+        self._group_of_view = views
         self._bases: dict[tuple[int, int], Tensor] = {}
+        self._slopes: Tensor | None = None
 
-    def assign(self, artifacts: Artifacts, photos: list[str]) -> None:
-        """Tell whose light it is.
+    def of_view(self, view: int) -> Tensor | None:
+        """The coefficients [5] of a training photo; None where it has the mean light."""
+        row = self._row_of_view.get(view)
+        return None if row is None else self.coefficients[row]
 
-        Args:
-            artifacts: the overlays of the training photos.
-            photos: the photos' paths relative to the dataset.
-        """
-        self.photos = photos
-        groups = [artifacts.group_of_view(view) for view in range(len(photos))]
-        bare = len(artifacts)  # a group of its own, without a gradient
-        self._group_of_view = [bare if group is None else group for group in groups]
-        self._groups = torch.tensor(self._group_of_view)
-
-    @torch.no_grad()
-    def start_from(self, artifacts: Artifacts, cache: list[dict[str, Any]]) -> None:
-        """Start from how the photos differ where the artifact hides the scene.
+    def light(self, view: int, coefficients: Tensor, overlay: ScreenSpaceOverlay, reduction: int) -> Tensor:
+        """The factor of B in a training photo, [H // reduction, W // reduction, 3], above 0.
 
         Args:
-            artifacts: the initial overlays.
-            cache: the datamanager's undistorted photos, in the order of `assign`.
+            view: the photo's.
+            coefficients: its own [5].
+            overlay: the one that the photo shows.
+            reduction: factor by which training images are reduced.
         """
-        for group, overlay in enumerate(artifacts.learned()):
-            views = [view for view, of in enumerate(self._group_of_view) if of == group]
-            images, masks = [cache[view]["image"] for view in views], [cache[view].get("mask") for view in views]
-            found = artifact_light(images, masks, _basis(overlay, 1), overlay.layers()[1])
-            self.coefficients[views] = found.to(self.coefficients)
-
-    def of_view(self, view: int, overlay: ScreenSpaceOverlay, reduction: int) -> Tensor:
-        """The factor of B in a training photo, [H // reduction, W // reduction, 3], above 0."""
         key = self._group_of_view[view], reduction
         if key not in self._bases:
             # Of one resolution: that of a training only rises.
             self._bases = {known: basis for known, basis in self._bases.items() if known[1] == reduction}
             self._bases[key] = _basis(overlay, reduction)
-        return light(self._bases[key], self.coefficients[view])
+        return light(self._bases[key], coefficients)
+
+    def add_gradient(self, view: int, gradient: Tensor) -> None:
+        """Add the gradient of a photo's coefficients [5] to that of all, which stays where it is in memory."""
+        if self.coefficients.grad is None:
+            self._slopes = torch.zeros_like(self.coefficients) if self._slopes is None else self._slopes.zero_()
+            self.coefficients.grad = self._slopes
+        self.coefficients.grad[self._row_of_view[view]] += gradient
 
     @torch.no_grad()
     def project(self) -> None:
         """Subtract the means over the photos of each overlay, which so has their mean light; then bound all."""
-        self._groups = self._groups.to(self.coefficients.device)
-        sums = self.coefficients.new_zeros(max(self._group_of_view) + 1, COEFFICIENTS + 1)
-        ones = torch.ones_like(self.coefficients[:, :1])
-        sums.index_add_(0, self._groups, torch.cat([self.coefficients, ones], dim=1))
-        self.coefficients.sub_((sums[:, :-1] / sums[:, -1:].clamp_min(1))[self._groups])
+        sums = self.coefficients.new_zeros(len(self._photos_of_groups), COEFFICIENTS)
+        sums.index_add_(0, self._groups, self.coefficients)
+        self.coefficients.sub_((sums / self._photos_of_groups)[self._groups])
         self.coefficients.clamp_(-MAX_COEFFICIENT, MAX_COEFFICIENT)
 
     def get_extra_state(self) -> dict[str, Any]:
@@ -92,70 +93,94 @@ class Shading(nn.Module):
         return {"photos": self.photos}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
-        """Take what a checkpoint holds."""
-        self.photos = list(state["photos"])
+        """Take what a checkpoint holds; `shading_at_start` has compared it."""
 
 
-def started(
-    shading: Shading | None,
+def shading_at_start(
+    setting: Setting,
     artifacts: Artifacts,
-    photos: list[str],
+    names: list[str],
     cache: list[dict[str, Any]] | None,
-    resumed: bool,
+    checkpoint: Path | None,
 ) -> Shading | None:
-    """The shading of a model whose overlays are there.
+    """The shading of a training whose overlays are there.
 
     Args:
-        shading: the model's.
-        artifacts: its overlays.
-        photos: the training photos' paths relative to the dataset.
-        cache: the datamanager's undistorted photos, which it starts from; None: from the same light in all photos.
-        resumed: a checkpoint, which is loaded later, holds the overlays and their light.
+        setting: auto: where the photos say that the light changes, and as the checkpoint has it.
+        artifacts: the model's overlays.
+        names: the training photos' paths relative to the dataset.
+        cache: the datamanager's undistorted photos in the same order; None where their exposure varies, too, so that
+            they do not tell.
+        checkpoint: that the training goes on from, which has the overlays; its coefficients are loaded later.
 
     Returns:
-        None where no overlay is learned, or none hides anything as it starts, so that a light would change nothing.
-    """
-    if shading is None or not artifacts.learned():
-        return None
-    if not resumed and not any((overlay.evidence < 1).any() for overlay in artifacts.learned()):
-        tell("The artifact hides nothing as the training starts: it has the same light in all photos.")
-        return None
-    shading.assign(artifacts, photos)
-    if cache is not None:
-        shading.start_from(artifacts, cache)
-    return shading
-
-
-def of_checkpoint(shading: Shading | None, state: dict[str, Any], prefix: str, training: bool) -> Shading | None:
-    """The shading of a model that loads a checkpoint: what is only rendered has the mean light, and needs none.
-
-    Args:
-        shading: the model's.
-        state: the model's state dict, from which entries are dropped that are not needed.
-        prefix: of the shading's entries in it.
-        training: whether the model goes on from the checkpoint.
+        None where all photos have the same light.
 
     Raises:
-        InputError: one of the two has no shading, or the checkpoint has that of other photos.
+        InputError: the setting is another than the checkpoint's, or the checkpoint has the light of other photos.
     """
-    if not training:
-        for name in [name for name in state if name.startswith(prefix)]:
-            del state[name]
+    if checkpoint is None:
+        return _shading_of_photos(setting, artifacts, names, cache)
+    state = load_pipeline_state(checkpoint)  # None: loading it will say what is wrong with it
+    return None if state is None else _resumed_shading(setting, artifacts, names, state, "_model.shading.")
+
+
+def _shading_of_photos(
+    setting: Setting, artifacts: Artifacts, names: list[str], cache: list[dict[str, Any]] | None
+) -> Shading | None:
+    """The shading of a training that begins."""
+    if setting == "off" or not artifacts.learned():
         return None
+    views: dict[int, int] = {}
+    found: list[Tensor] = []
+    for group, overlay in enumerate(artifacts.learned()):
+        own = [view for view in range(len(names)) if artifacts.group_of_view(view) == group]
+        if not (overlay.evidence < 1).any():
+            continue  # it hides nothing as it starts, so that a light would change nothing
+        if cache is None:
+            started = ArtifactLight(overlay.evidence.new_zeros(len(own), COEFFICIENTS), 0.0)
+        else:
+            images, masks = [cache[view]["image"] for view in own], [cache[view].get("mask") for view in own]
+            started = artifact_light(images, masks, _basis(overlay, 1), overlay.layers())
+        if setting == "affine" or started.changes:
+            views |= dict.fromkeys(own, group)
+            found.append(started.coefficients)
+    if not found:
+        if setting == "affine":
+            tell("The artifact hides nothing as the training starts: it has the same light in all photos.")
+        return None
+    if setting == "auto":
+        tell(
+            f"The light on the artifact changes: each of {counted(len(views), 'photo')} has its own. "
+            "(--pipeline.model.shading off: the same in all.)"
+        )
+    return Shading(views, names, torch.cat(found))
+
+
+def _resumed_shading(
+    setting: Setting, artifacts: Artifacts, names: list[str], state: dict[str, Any], prefix: str
+) -> Shading | None:
+    """The shading of a training that goes on, with room for the coefficients in the pipeline's state."""
     saved = state.get(f"{prefix}coefficients")
-    if (saved is None) != (shading is None):
-        there, setting = ("no", "off") if saved is None else ("a", "affine")
+    if setting != "auto" and (saved is None) != (setting == "off"):
+        there, wanted = ("no", "off") if saved is None else ("a", "affine")
         raise InputError(
             f"the checkpoint has {there} shading of the artifact, this run's setting is another",
-            f"resume with --pipeline.model.shading {setting}",
+            f"resume with --pipeline.model.shading {wanted}, or without it",
         )
-    if shading is not None and saved is not None and state[f"{prefix}_extra_state"]["photos"] != shading.photos:
+    if saved is None or not artifacts.learned():
+        return None
+    view_of = {name: view for view, name in enumerate(names)}
+    groups = {name: artifacts.group_of_view(view) for name, view in view_of.items()}
+    there = state[f"{prefix}_extra_state"]["photos"]
+    views = {view_of[name]: group for name in there if (group := groups.get(name)) is not None}
+    if len(views) < len(there):
         raise InputError(
-            f"the checkpoint has the shading of {len(saved)} photos, and this run's {len(shading.photos)} are not "
-            "the same in the same order",
+            f"the checkpoint has the shading of {counted(len(there), 'photo')}, "
+            f"and {len(there) - len(views)} of them {'is' if len(there) - len(views) == 1 else 'are'} missing",
             "resume with the photos it was trained with",
         )
-    return shading
+    return Shading(views, names, torch.zeros_like(saved, device=artifacts.learned()[0].evidence.device))
 
 
 def _basis(overlay: ScreenSpaceOverlay, reduction: int) -> Tensor:

@@ -31,7 +31,7 @@ from ssa_nerfstudio.plugin.first_view import FirstView
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
-from ssa_nerfstudio.plugin.photo_shading import started
+from ssa_nerfstudio.plugin.photo_shading import shading_at_start
 from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.densification import gaussian_budget
@@ -96,18 +96,19 @@ class SSAPipeline(VanillaPipeline):
 
     def _examine_photos(self) -> None:
         """All that reads the training photos before the first step."""
-        dataset, resumed = self.datamanager.train_dataset, self.config.artifacts_of is not None
+        dataset, checkpoint = self.datamanager.train_dataset, self.config.artifacts_of
         tell_of_fisheyes(dataset.raw_cameras)
         lenses = describe_lenses(dataset.raw_cameras)
         # Undistorts and crops the photos and rewrites the cameras: overlays and depths are of the undistorted frame.
         photos = self.datamanager.cached_train
         names = self.datamanager.photo_names(dataset)
-        if not resumed:
+        if checkpoint is None:
             check_masks(photos, group_cameras(dataset.cameras)[1], names)
         samples = self._start_exposure()
         self._set_overlays(photos, lenses)
-        known = photos if not resumed and self.model.exposure is None else None
-        self.model.shading = started(self.model.shading, self.model.artifacts, names, known, resumed)
+        known = photos if self.model.exposure is None else None
+        shading = self.config.model.shading
+        self.model.shading = shading_at_start(shading, self.model.artifacts, names, known, checkpoint)
         self.sphere = self._shared_sphere()
         if self.model.exposure is not None and samples is not None and len(self.model.artifacts):
             by_photos = self.config.model.exposure_place == "auto"

@@ -46,10 +46,10 @@ class ModelSettings(SplatfactoModelConfig):
     """What exposure acts on. photo: on scene and artifact together, for an artifact on or in front of the lens; scene:
     on the scene alone, for what software drew into the finished photo; auto: as the photos' samples of the scene's
     points say, and photo where they say nothing."""
-    shading: Literal["off", "affine"] = "off"
+    shading: Literal["auto", "off", "affine"] = "auto"
     """affine: learn the light on the artifact in each photo, a tint and a brightness whose logarithm changes linearly
-    over it: for a finger, or a part of the camera's rig, that keeps its place in changing light. A step takes longer.
-    Measured behind simulated fingers on a CPU alone. off: the artifact has the same light in all photos."""
+    over it: for a finger, or a part of the camera's rig, that keeps its place in changing light. off: the artifact has
+    the same light in all photos. auto: affine where the photos show that it changes, and no exposure is learned."""
     sparsity: Sparsity = "log"
     """Sparsity term of the matte: log (concave, weighted by the initial transmittance), l1 (the paper's), off."""
     sparsity_weight: float | None = None

@@ -18,8 +18,9 @@ SETTINGS = pytest.mark.parametrize(
         {},
         {"overlay": "off"},
         {"strategy": "mcmc", "ignore_background": False, "sparsity": "l1", "overlay_downscale": 2},
+        {"shading": "affine", "overlay_start": "points"},
     ],
-    ids=["default", "without overlay", "others"],
+    ids=["default", "without overlay", "others", "shading"],
 )
 
 
@@ -63,6 +64,7 @@ def test_recorded_losses_train_the_same(set_up, monkeypatch, settings):
         record_losses(monkeypatch, recorded)
         trainer = set_up("cpu", settings)
         model = trainer.pipeline.model
+        assert (model.shading is not None) == ("shading" in settings)
         for step in range(24):
             model.step_cb(trainer.optimizers, step)
             trainer.pipeline.train()
