@@ -1,6 +1,7 @@
 """Error of the start against the artifact that was simulated: `python benchmarks/start_accuracy.py --data DIR`
 
-Of clean datasets it is the error where nothing is in front.
+Of clean datasets it is the error where nothing is in front. `light`: how much of what the scene leaves unexplained a
+light for each photo explains (`evidence.artifact_light`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
+from ssa_nerfstudio.evidence.artifact_light import artifact_light
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
@@ -33,6 +35,7 @@ from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.shading import shading_basis
 
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
@@ -155,18 +158,19 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
-    def start(changed: bool) -> tuple[Detection, LayerEstimate, tuple[torch.Tensor, torch.Tensor]]:
+    def start(changed: bool) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
         detection = detect(statistics) if changed else plain
         found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
         initialize_from(overlay, found, guide, detection.mask)
-        return detection, found, overlay.layers()
+        return detection, found, overlay
 
     own = None
     for constant, factor in variants:
         started, module, seeds = time.monotonic(), constant.split(".")[0], {}
         if module in SEEDS or not constant:
-            detection, found, layers = own = own or start(False)
+            detection, found, overlay = own = own or start(False)
+            layers = overlay.layers()
             with _scaled(constant, factor):
                 photos = scene_photos(views, [layers] * len(views), [0] * len(views))
                 found_seeds = seeds_between(points, photos)
@@ -174,7 +178,10 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             seeds = {name: len(each) for name, each in zip(("seeds", "gaps", "backdrop"), counted, strict=True)}
         else:
             with _scaled(constant, factor):
-                detection, found, layers = start(module in DETECTION)
+                detection, found, overlay = start(module in DETECTION)
+            layers = overlay.layers()
+        images, masks = [view.image for view in views], [view.mask for view in views]
+        light = artifact_light(images, masks, shading_basis(1 - overlay.evidence), layers)
         error = torch.cat(layers, dim=-1).detach() - truth
         size = error.abs()
         yield {
@@ -187,6 +194,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "T_off": _mean(size[~covered][:, 0]),
             "B_off": _mean(size[~covered][:, 1:]),
             "adds_light": found.adds_light(),
+            "light": round(light.explained, 3),
             "verdict": detection.verdict,
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),

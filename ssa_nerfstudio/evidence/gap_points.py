@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import torch
-from scipy.spatial import KDTree
+from scipy.spatial import ConvexHull, KDTree, QhullError
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.distant_points import Sphere
@@ -43,8 +43,9 @@ MAX_VIEWS = 32
 def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tuple[Seeds, Seeds]:
     """Fill the frames between points, at their depth, photo by photo, with the seeds of those before as further points.
 
-    A seed that hides points in the frame of another photo is at a wrong depth, as beside the outline of something near,
-    and is left out.
+    Where no points are around, as in the corner of a room beyond the last one, nothing tells the depth, and there are no
+    seeds. One that hides points in the frame of another photo is at a wrong depth, as beside the outline of something
+    near, and is left out.
 
     Then what a photo hides, because of an opaque artifact or a mask, where there are neither points nor seeds: probably
     no photo shows it. It continues the colors around, far away, because splats that photos show may be there.
@@ -83,7 +84,11 @@ def _between(photo: ScenePhoto, taken: Tensor, spaces: Sequence[_FreeSpace]) -> 
     if len(seen.pixel) < NEIGHBORS:
         return Seeds.none(taken)
     width = photo.size[1]
-    depth = _depth(gaps, torch.stack([seen.pixel // width, seen.pixel % width], dim=-1), seen.depth)
+    places = torch.stack([seen.pixel // width, seen.pixel % width], dim=-1)
+    gaps = gaps[_in_hull(gaps, places)]
+    if not len(gaps):
+        return Seeds.none(taken)
+    depth = _depth(gaps, places, seen.depth)
     camera, rays = _rays(photo, gaps, taken)
     color = photo.color[tuple(gaps.to(photo.color.device).mT)]
     seeds = Seeds(camera + depth[:, None] * rays, color.to(taken), _width(photo) * depth)
@@ -169,6 +174,16 @@ def _hide_points(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
         behind = space.depths[camera, working_pixels(position, space.size, space.reduction)]
         hide[index[(behind > depth * (1 + CLEAR_BY)) & behind.isfinite()]] = True
     return hide
+
+
+def _in_hull(gaps: Tensor, places: Tensor) -> Tensor:
+    """[G] bool: whether a pixel [G, 2] is between others [M, 2], in their convex hull; on one line nothing is."""
+    try:
+        sides = torch.from_numpy(ConvexHull(places.cpu().numpy()).equations)
+    except QhullError:
+        return torch.zeros_like(gaps[:, 0], dtype=torch.bool)
+    inside = gaps.cpu().to(sides) @ sides[:, :2].mT + sides[:, 2] <= 1e-9
+    return inside.all(dim=1).to(gaps.device)
 
 
 def _nearest(gaps: Tensor, places: Tensor) -> Tensor:

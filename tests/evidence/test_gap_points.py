@@ -72,6 +72,14 @@ def test_a_gap_is_filled_at_the_depth_around_it_in_the_photos_colors() -> None:
     assert not len(gaps(wall_points(gap=0.0), [wall_view(pose())])), "there is none"
 
 
+def test_beyond_the_last_point_nothing_tells_the_depth() -> None:
+    """A photo that points cover as far as its middle, with a gap between them, has seeds in the gap alone."""
+    points = wall_points()
+    assert len(gaps(points[points[:, 0] < 1.3], [wall_view(pose())])) == len(gaps(points, [wall_view(pose())]))
+    line = points[(points[:, 1] - 1.5).abs() < 0.01]
+    assert not len(gaps(line, [wall_view(pose())])), "nor beside a line"
+
+
 def test_what_one_photo_has_filled_the_next_ones_leave() -> None:
     """From another place, and from nearer, where it has a larger gap between seeds, too."""
     one = len(gaps(wall_points(), [wall_view(pose())]))
