@@ -43,9 +43,9 @@ MAX_VIEWS = 32
 def gap_points(points: Tensor, photos: Sequence[ScenePhoto], far: Sphere) -> tuple[Seeds, Seeds]:
     """Fill the frames between points, at their depth, photo by photo, with the seeds of those before as further points.
 
-    Where no points are around, as in the corner of a room beyond the last one, nothing tells the depth, and there are no
-    seeds. One that hides points in the frame of another photo is at a wrong depth, as beside the outline of something
-    near, and is left out.
+    Where points are not all around, as in the corner of a room beyond the last one, nothing tells the depth, and there
+    are no seeds. One that hides points in the frame of another photo is at a wrong depth, as beside the outline of
+    something near, and is left out.
 
     Then what a photo hides, because of an opaque artifact or a mask, where there are neither points nor seeds: probably
     no photo shows it. It continues the colors around, far away, because splats that photos show may be there.
