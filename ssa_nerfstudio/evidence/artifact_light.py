@@ -9,17 +9,22 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
-from ssa_nerfstudio.evidence.layer_estimate import PRIOR_SCALE
+from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, MIN_SHARE
 from ssa_nerfstudio.evidence.point_samples import working_reduction
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS
 
-MIN_OPACITY = 0.5
-"""Of the pixels that count: the artifact's light is at least as much as the scene's."""
+HIDING = 0.5
+"""Opacity above which a pixel counts: the artifact's light is at least as much as the scene's."""
 MAX_COEFFICIENT = 1.0
 """Of a coefficient: a factor of 2.7 in the brightness of what is opaque; beyond it, something else is there."""
-MIN_EXPLAINED = 1 / 3
-"""Share of what the scene does not explain from which on the light changes: it explains half as much as it leaves."""
+SCENE_DEVIATIONS = 2.0
+"""By how many of its standard deviations the scene behind an artifact may differ from photo to photo."""
+MIN_EXPLAINED = 0.05
+"""Share of what the scene does not explain from which on the light changes. Where it does not, at most 0.035 is."""
+
+_LIGHT, _SCENE = slice(0, COEFFICIENTS), slice(COEFFICIENTS, None)
+"""Terms of both."""
 
 
 @dataclass(frozen=True)
@@ -31,11 +36,13 @@ class ArtifactLight:
     explained: float
     """How much of the photos' differences it explains, of those that the scene does not as it comes through, in [0, 1];
     0 where no pixel is hidden."""
+    hidden: float
+    """Share of the frame that counts, in [0, 1]. Of a spot the scene's own differences pass for light."""
 
     @property
     def changes(self) -> bool:
         """Whether the light is not the same in all photos."""
-        return self.explained > MIN_EXPLAINED
+        return self.explained > MIN_EXPLAINED and self.hidden >= MIN_SHARE
 
 
 @torch.no_grad()
@@ -47,9 +54,10 @@ def artifact_light(
     By least squares, I_i - mean(I) = B (basis coefficients_i), the linear part of the light. What the scene changes
     where it comes through is taken for light, too, so these are a start and no more.
 
-    Light is judged beside a scene of as many coefficients, T (own gains and slopes of the photo): the share of the
-    squares that are left without light, and are not with it. To them are added those of a scene that comes through by
-    PRIOR_SCALE more than T says, because T is not known better.
+    Light is judged beside a scene of as many coefficients, T (own gains and slopes of the photo), each at most
+    SCENE_DEVIATIONS of the scene's own: of the squares that the scene leaves, the share that light explains, alone or
+    with another scene. To them are added those of a scene that comes through by MIN_OPACITY more than T says, because
+    T is not known better.
 
     Args:
         images: photos behind the same artifact, [H, W, 3 or 4] of one size.
@@ -60,9 +68,9 @@ def artifact_light(
     reduction = working_reduction(*basis.shape[:2])
     basis = reduced(basis, reduction)
     transmittance, addition = (reduced(layer, reduction) for layer in layers)
-    counts = basis[..., 0] > MIN_OPACITY
+    counts = basis[..., 0] > HIDING
     if not counts.any():
-        return ArtifactLight(basis.new_zeros(len(images), COEFFICIENTS), 0.0)
+        return ArtifactLight(basis.new_zeros(len(images), COEFFICIENTS), 0.0, 0.0)
     own, slopes = basis[counts].split((1, 2), dim=-1)
     through = transmittance[counts].mean(dim=-1, keepdim=True).expand(-1, 3)
     # [N, 3 channels, 5] each: a gain for each channel, slopes for all.
@@ -77,13 +85,31 @@ def artifact_light(
     squares = torch.einsum("nci,ncj->nij", terms, terms)  # once: for each photo it would be large
     products = torch.einsum("vn,nij->vij", weights[..., 0].double(), squares).cpu()
     sums = torch.einsum("vnc,nci->vi", change, terms).cpu()
-    light, scene, both = slice(0, COEFFICIENTS), slice(COEFFICIENTS, None), slice(None)
-    by_scene, by_both = (float((sums[:, part] * _solved(products, sums, part)).sum()) for part in (scene, both))
-    unknown = PRIOR_SCALE**2 * _variance([photo[~counts.to(photo.device)] for photo in seen])
-    left = float(change.square().sum()) - by_scene + 3 * float(weights.sum()) * unknown
-    found = _solved(products, sums, light).clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
-    explained = min(max((by_both - by_scene) / max(left, 1e-12), 0.0), 1.0)
-    return ArtifactLight(found - found.mean(dim=0), explained)
+    found = _solved(products, sums, _LIGHT).clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
+    variance = _variance([photo[~counts.to(photo.device)] for photo in seen])
+    uncertain = 3 * float(weights.sum()) * MIN_OPACITY**2 * variance
+    explained = _share_of_light(products, sums, change.square().sum(), SCENE_DEVIATIONS * variance**0.5, uncertain)
+    return ArtifactLight(found - found.mean(dim=0), explained, float(counts.float().mean()))
+
+
+def _share_of_light(products: Tensor, sums: Tensor, total: Tensor, bound: float, uncertain: float) -> float:
+    """Of the squares that the scene leaves, the share that light explains, alone or with another scene.
+
+    Args:
+        products: of the terms with each other [V, 10, 10], _LIGHT before _SCENE.
+        sums: of the terms with the photos' differences [V, 10].
+        total: squares of these [].
+        bound: of the scene's coefficients.
+        uncertain: squares that are added to those that the scene leaves.
+    """
+    scene = _solved(products, sums, _SCENE).clamp(-bound, bound)
+    by_scene = (products[:, :, _SCENE] @ scene[..., None])[..., 0]
+    left = float(total + (scene * (by_scene - 2 * sums)[:, _SCENE]).sum()) + uncertain
+    sums = sums - by_scene
+    alone, other_scene, together = (
+        float((sums[:, part] * _solved(products, sums, part)).sum()) for part in (_LIGHT, _SCENE, slice(None))
+    )
+    return min(max(alone, together - other_scene, 0.0) / max(left, 1e-12), 1.0)
 
 
 def _terms(of_gains: Tensor, of_slopes: Tensor, slopes: Tensor) -> Tensor:
@@ -110,7 +136,7 @@ def _variance(photos: list[Tensor]) -> float:
     for photo in photos:
         mean += photo / len(photos)
         square += photo.square() / len(photos)
-    return float((square - mean.square()).mean()) if mean.numel() else 0.0
+    return float((square - mean.square()).clamp_min(0).mean()) if mean.numel() else 0.0
 
 
 def _weight(mask: Tensor | None, counts: Tensor, reduction: int) -> Tensor:

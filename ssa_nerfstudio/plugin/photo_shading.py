@@ -138,7 +138,7 @@ def _shading_of_photos(
         if not (overlay.evidence < 1).any():
             continue  # it hides nothing as it starts, so that a light would change nothing
         if cache is None:
-            started = ArtifactLight(overlay.evidence.new_zeros(len(own), COEFFICIENTS), 0.0)
+            started = ArtifactLight(overlay.evidence.new_zeros(len(own), COEFFICIENTS), 0.0, 0.0)
         else:
             images, masks = [cache[view]["image"] for view in own], [cache[view].get("mask") for view in own]
             started = artifact_light(images, masks, _basis(overlay, 1), overlay.layers())

@@ -74,7 +74,7 @@ def tinted(scene: torch.Tensor, own: torch.Tensor) -> torch.Tensor:
     return (scene + 0.2 * own[:3] + 0.2 * own[3] * across).clamp(0, 1)
 
 
-@pytest.mark.parametrize("brightness", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("brightness", [0.0, 0.003, 0.1])
 def test_what_the_scene_explains_is_no_light(brightness):
     """A scene that comes through changes from photo to photo, too, but as much as comes through, not as is opaque."""
     made = torch.zeros(HEIGHT, WIDTH, 1)
@@ -90,6 +90,20 @@ def test_what_the_scene_explains_is_no_light(brightness):
     assert found.changes == (brightness == 0.1), found.explained
     if not brightness:
         assert found.coefficients.abs().max() > 0.03  # by itself it would pass for light
+
+
+def test_of_a_spot_the_scene_passes_for_light():
+    """Of a spot five coefficients explain much of whatever comes through, so there is none."""
+    generator = torch.Generator().manual_seed(4)
+    for size, changes in ((6, False), (24, True)):
+        made = torch.zeros(HEIGHT, WIDTH, 1)
+        made[8 : 8 + size, 20 : 20 + size] = 0.98
+        layers, basis = (1 - made, made * torch.tensor([0.5, 0.4, 0.3])), shading_basis(made)
+        own = 0.1 * torch.randn(20, generator=generator)
+        images = [layers[1] * each.exp() + 0.5 * layers[0] for each in own]
+        found = artifact_light(images, [None] * 20, basis, layers)
+        assert found.explained > 0.9
+        assert found.changes == changes
 
 
 def test_without_an_opaque_pixel_the_light_is_the_same_everywhere():
