@@ -1,7 +1,7 @@
 """Error of the start against the artifact that was simulated: `python benchmarks/start_accuracy.py --data DIR`
 
 Of clean datasets it is the error where nothing is in front. `light`: how much of what the scene leaves unexplained a
-light for each photo explains (`evidence.artifact_light`).
+light for each photo explains, over the share `hidden` of the frame (`evidence.artifact_light`).
 """
 
 from __future__ import annotations
@@ -195,6 +195,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "B_off": _mean(size[~covered][:, 1:]),
             "adds_light": found.adds_light(),
             "light": round(light.explained, 3),
+            "hidden": round(light.hidden, 3),
             "verdict": detection.verdict,
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),
