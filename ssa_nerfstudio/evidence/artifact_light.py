@@ -23,6 +23,8 @@ SCENE_DEVIATIONS = 2.0
 MIN_EXPLAINED = 0.05
 """Share of what the scene does not explain from which on the light changes. Where it does not, at most 0.035 is."""
 
+MAX_PIXELS = 4096
+"""Of those that count, a regular subset: light is smooth."""
 _LIGHT, _SCENE = slice(0, COEFFICIENTS), slice(COEFFICIENTS, None)
 """Terms of both."""
 
@@ -71,22 +73,23 @@ def artifact_light(
     counts = basis[..., 0] > HIDING
     if not counts.any():
         return ArtifactLight(basis.new_zeros(len(images), COEFFICIENTS), 0.0, 0.0)
-    own, slopes = basis[counts].split((1, 2), dim=-1)
-    through = transmittance[counts].mean(dim=-1, keepdim=True).expand(-1, 3)
+    pixels, others = (each.flatten().nonzero()[:, 0] for each in (counts, ~counts))
+    pixels = pixels[:: -(-len(pixels) // MAX_PIXELS)]
+    own, slopes = basis.reshape(-1, 3)[pixels].split((1, 2), dim=-1)
+    addition = addition.reshape(-1, 3)[pixels]
+    through = transmittance.mean(dim=-1).reshape(-1, 1)[pixels].expand(-1, 3)
     # [N, 3 channels, 5] each: a gain for each channel, slopes for all.
-    of_light = _terms(addition[counts] * own, addition[counts], slopes)
+    of_light = _terms(addition * own, addition, slopes)
     of_scene = _terms(through, through, slopes / own)
     terms = torch.cat([of_light, of_scene], dim=-1).double()
-    seen = [reduced(image[..., :3].float(), reduction) / FULL_SCALE.get(image.dtype, 1.0) for image in images]
-    shown = torch.stack([photo.to(basis.device)[counts] for photo in seen])
-    weights = torch.stack([_weight(mask, counts, reduction) for mask in masks])
+    shown, variance = _read(images, pixels, others, reduction)
+    weights = torch.stack([_weight(mask, pixels, reduction) for mask in masks])
     mean = (weights * shown).sum(dim=0) / weights.sum(dim=0).clamp_min(1)
     change = (weights * (shown - mean)).double()
     squares = torch.einsum("nci,ncj->nij", terms, terms)  # once: for each photo it would be large
     products = torch.einsum("vn,nij->vij", weights[..., 0].double(), squares).cpu()
     sums = torch.einsum("vnc,nci->vi", change, terms).cpu()
     found = _solved(products, sums, _LIGHT).clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
-    variance = _variance([photo[~counts.to(photo.device)] for photo in seen])
     uncertain = 3 * float(weights.sum()) * MIN_OPACITY**2 * variance
     explained = _share_of_light(products, sums, change.square().sum(), SCENE_DEVIATIONS * variance**0.5, uncertain)
     return ArtifactLight(found - found.mean(dim=0), explained, float(counts.float().mean()))
@@ -130,18 +133,28 @@ def _solved(products: Tensor, sums: Tensor, part: slice) -> Tensor:
     return torch.linalg.solve(products + ridge[:, None, None] * identity, sums[:, part])
 
 
-def _variance(photos: list[Tensor]) -> float:
-    """Mean variance over photos [N, 3] of their values; 0 where N is."""
-    mean, square = torch.zeros_like(photos[0]), torch.zeros_like(photos[0])
-    for photo in photos:
-        mean += photo / len(photos)
-        square += photo.square() / len(photos)
-    return float((square - mean.square()).clamp_min(0).mean()) if mean.numel() else 0.0
+def _read(images: Sequence[Tensor], pixels: Tensor, others: Tensor, reduction: int) -> tuple[Tensor, float]:
+    """Some working pixels of the photos, [V, N, 3] in [0, 1], and the mean variance of others; 0 where there are none.
+
+    Args:
+        images: [H, W, 3 or 4] each.
+        pixels: indices [N], row by row, whose device the result is on.
+        others: indices [M].
+        reduction: photo pixels a working pixel.
+    """
+    shown, mean, square = [], 0.0, 0.0
+    for image in images:
+        photo = reduced(image[..., :3].float(), reduction).reshape(-1, 3) / FULL_SCALE.get(image.dtype, 1.0)
+        shown.append(photo[pixels.to(photo.device)].to(pixels.device))
+        behind = photo[others.to(photo.device)]
+        mean, square = mean + behind / len(images), square + behind.square() / len(images)
+    variance = torch.as_tensor(square) - torch.as_tensor(mean).square()
+    return torch.stack(shown), float(variance.clamp_min(0).mean()) if len(others) else 0.0
 
 
-def _weight(mask: Tensor | None, counts: Tensor, reduction: int) -> Tensor:
+def _weight(mask: Tensor | None, pixels: Tensor, reduction: int) -> Tensor:
     """[N, 1]: 1 where a photo counts, elsewhere 0."""
     if mask is None:
-        return torch.ones(int(counts.sum()), 1, device=counts.device)
-    whole = reduced((mask != 0).reshape(*mask.shape[:2], 1).float(), reduction)
-    return (whole.to(counts.device)[counts] == 1).float()
+        return torch.ones(len(pixels), 1, device=pixels.device)
+    whole = reduced((mask != 0).reshape(*mask.shape[:2], 1).float(), reduction).flatten()
+    return (whole[pixels.to(whole.device)].to(pixels.device) == 1).float()[:, None]

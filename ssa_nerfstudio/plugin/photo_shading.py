@@ -16,6 +16,7 @@ from torch.nn import Parameter
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, ArtifactLight, artifact_light
+from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import to_training_scale
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS, light, shading_basis
@@ -137,14 +138,10 @@ def _shading_of_photos(
         own = [view for view in range(len(names)) if artifacts.group_of_view(view) == group]
         if not (overlay.evidence < 1).any():
             continue  # it hides nothing as it starts, so that a light would change nothing
-        if cache is None:
-            started = ArtifactLight(overlay.evidence.new_zeros(len(own), COEFFICIENTS), 0.0, 0.0)
-        else:
-            images, masks = [cache[view]["image"] for view in own], [cache[view].get("mask") for view in own]
-            started = artifact_light(images, masks, _basis(overlay, 1), overlay.layers())
-        if setting == "affine" or started.changes:
+        started = _light_at_start(setting, overlay, None if cache is None else [cache[view] for view in own], len(own))
+        if started is not None:
             views |= dict.fromkeys(own, group)
-            found.append(started.coefficients)
+            found.append(started)
     if not found:
         if setting == "affine":
             tell("The artifact hides nothing as the training starts: it has the same light in all photos.")
@@ -155,6 +152,25 @@ def _shading_of_photos(
             "(--pipeline.model.shading off: the same in all.)"
         )
     return Shading(views, names, torch.cat(found))
+
+
+def _light_at_start(
+    setting: Setting, overlay: ScreenSpaceOverlay, photos: list[dict[str, Any]] | None, count: int
+) -> Tensor | None:
+    """Coefficients [count, 5] of an overlay's photos; None where they have the same light, as the setting goes."""
+    if photos is None:
+        return overlay.evidence.new_zeros(count, COEFFICIENTS) if setting == "affine" else None
+
+    def found(some: list[dict[str, Any]]) -> ArtifactLight:
+        images, masks = [photo["image"] for photo in some], [photo.get("mask") for photo in some]
+        return artifact_light(images, masks, _basis(overlay, 1), overlay.layers())
+
+    # Whether it changes, a regular subset tells.
+    some = photos[:: -(-count // MAX_VIEWS)]
+    if setting == "auto" and len(some) < count and not found(some).changes:
+        return None
+    light = found(photos)
+    return light.coefficients if setting == "affine" or light.changes else None
 
 
 def _resumed_shading(

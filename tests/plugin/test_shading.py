@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.artifact_light import artifact_light
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.shading import light, shading_basis
+from ssa_nerfstudio.plugin import photo_shading
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.photo_formation import predicted_photo
@@ -226,6 +228,21 @@ def test_a_training_finds_the_light(trained, varying_scene):
     torch.testing.assert_close(found.mean(dim=0), torch.zeros(5), atol=1e-6, rtol=0)
     logs = varying_scene[1]
     assert np.corrcoef(found[:, :3].mean(dim=1).numpy(), logs)[0, 1] > 0.95
+
+
+def test_of_many_photos_some_tell_and_all_have_a_light(train, monkeypatch):
+    monkeypatch.setattr(photo_shading, "MAX_VIEWS", 5)
+    assert len(train(steps=1).pipeline.model.shading.photos) == 12
+    asked = []
+    found = photo_shading.artifact_light
+
+    def unchanging(images, *others):
+        asked.append(len(images))
+        return replace(found(images, *others), explained=0.0)
+
+    monkeypatch.setattr(photo_shading, "artifact_light", unchanging)
+    assert train(steps=1).pipeline.model.shading is None
+    assert asked == [4]
 
 
 def test_it_explains_the_photos_of_the_artifact(trained, train):
