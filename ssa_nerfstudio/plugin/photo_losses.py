@@ -150,6 +150,6 @@ class PhotoLosses(SplatfactoModel):
         return self._can_be_recorded(with_depth) and self.device.type == "cuda" and graphs_are_usable()
 
     def _can_be_recorded(self, with_depth: bool) -> bool:
-        """Whether the losses of this step read no parameter that belongs to the view, and nothing else the pictures."""
+        """Whether the losses read no parameter of the view but their inputs, and nothing else the pictures."""
         of_views = self.config.use_bilateral_grid or self.exposure is not None
         return self.training and self.recordable and torch.is_grad_enabled() and not (with_depth or of_views)

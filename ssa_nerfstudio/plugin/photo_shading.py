@@ -15,7 +15,8 @@ from torch.nn import Parameter
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, ArtifactLight, artifact_light
+from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, ArtifactLight, artifact_light, hidden_share
+from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
 from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import to_training_scale
@@ -165,6 +166,8 @@ def _light_at_start(
         images, masks = [photo["image"] for photo in some], [photo.get("mask") for photo in some]
         return artifact_light(images, masks, _basis(overlay, 1), overlay.layers())
 
+    if setting == "auto" and hidden_share(_basis(overlay, 1)) < MIN_SHARE:
+        return None
     # Whether it changes, a regular subset tells.
     some = photos[:: -(-count // MAX_VIEWS)]
     if setting == "auto" and len(some) < count and not found(some).changes:
@@ -182,20 +185,24 @@ def _resumed_shading(
         there, wanted = ("no", "off") if saved is None else ("a", "affine")
         raise InputError(
             f"the checkpoint has {there} shading of the artifact, this run's setting is another",
-            f"resume with --pipeline.model.shading {wanted}, or without it",
+            f"resume with --pipeline.model.shading {wanted}, or leave the option out",
         )
     if saved is None or not artifacts.learned():
         return None
-    view_of = {name: view for view, name in enumerate(names)}
-    groups = {name: artifacts.group_of_view(view) for name, view in view_of.items()}
     there = state[f"{prefix}_extra_state"]["photos"]
-    views = {view_of[name]: group for name in there if (group := groups.get(name)) is not None}
-    if len(views) < len(there):
+    views_of: dict[str, list[int]] = {}
+    for view, name in reversed(list(enumerate(names))):  # a photo may be listed twice
+        views_of.setdefault(name, []).append(view)
+    found = [views_of[name].pop() for name in there if views_of.get(name)]
+    if missing := len(there) - len(found):
         raise InputError(
             f"the checkpoint has the shading of {counted(len(there), 'photo')}, "
-            f"and {len(there) - len(views)} of them {'is' if len(there) - len(views) == 1 else 'are'} missing",
+            f"and {missing} of them {'is' if missing == 1 else 'are'} missing",
             "resume with the photos it was trained with",
         )
+    bare = len(artifacts)  # of a photo without an overlay, whose light changes nothing
+    groups = [artifacts.group_of_view(view) for view in found]
+    views = {view: bare if group is None else group for view, group in zip(found, groups, strict=True)}
     return Shading(views, names, torch.zeros_like(saved, device=artifacts.learned()[0].evidence.device))
 
 

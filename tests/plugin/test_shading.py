@@ -18,7 +18,7 @@ from ssa_nerfstudio.plugin import photo_shading
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.photo_formation import predicted_photo
-from ssa_nerfstudio.plugin.photo_shading import Shading
+from ssa_nerfstudio.plugin.photo_shading import Shading, shading_at_start
 
 HEIGHT, WIDTH, VIEWS = 40, 60, 9
 
@@ -92,6 +92,107 @@ def test_what_the_scene_explains_is_no_light(brightness):
     assert found.changes == (brightness == 0.1), found.explained
     if not brightness:
         assert found.coefficients.abs().max() > 0.03  # by itself it would pass for light
+
+
+def box(matte: float, border: int = 10) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
+    """The basis and the layers of an artifact of one color that leaves a border of the frame clear."""
+    made = torch.zeros(HEIGHT, WIDTH, 1)
+    made[border : HEIGHT - border, border : WIDTH - border] = matte
+    return shading_basis(made), (1 - made, made * torch.tensor([0.5, 0.4, 0.3]))
+
+
+def scenes(count: int = 30) -> list[torch.Tensor]:
+    generator = torch.Generator().manual_seed(5)
+    plain = torch.full((HEIGHT, WIDTH, 3), 0.5)
+    return [
+        tinted(plain, each) + 0.004 * torch.randn(plain.shape, generator=generator)
+        for each in torch.randn(count, 4, generator=generator)
+    ]
+
+
+def test_a_panel_of_one_color_has_a_light_though_any_scene_behind_would_do():
+    """A scene that may have any brightness would explain it: 0.02 T times 2.5 of white."""
+    basis, (transmittance, addition) = box(0.98)
+    images = [transmittance * scene + addition * (0.1 * (-1) ** number + 1) for number, scene in enumerate(scenes())]
+    assert artifact_light(images, [None] * 30, basis, (transmittance, addition)).changes
+
+
+def test_light_is_explained_beside_a_scene_that_comes_through():
+    """Of a soft artifact both change alike, so that neither explains alone what it has to."""
+    made = torch.linspace(0.55, 0.95, WIDTH)[None, :, None].expand(HEIGHT, WIDTH, 1).clone()
+    made[:10] = 0
+    basis, layers = shading_basis(made), (1 - made, made * torch.tensor([0.5, 0.4, 0.3]))
+    flat = torch.full((HEIGHT, WIDTH, 3), 0.5)
+    images = []
+    for number, own in enumerate(torch.randn(30, 4, generator=torch.Generator().manual_seed(6))):
+        factor = 1 + 0.2 * basis[..., :1] * (-1) ** (number // 3)
+        images.append(layers[0] * tinted(flat, 2 * own) + factor * layers[1])
+    assert artifact_light(images, [None] * 30, basis, layers).explained > 0.2, "0.15 alone"
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_what_masks_hide_does_not_count_as_scene(masked):
+    """More comes through than T says, as far as that is uncertain. A black border would make the scene calmer."""
+    basis, (transmittance, addition) = box(0.9)
+    images = [(transmittance + 0.04 * (basis[..., :1] > 0)) * scene + addition for scene in scenes()]
+    mask = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+    if masked:
+        mask[:8], mask[-8:], mask[:, :8], mask[:, -8:] = False, False, False, False
+        images = [image * mask for image in images]
+    found = artifact_light(images, [mask] * 30, basis, (transmittance, addition))
+    assert 0.005 < found.explained < 0.04
+    assert not found.changes
+
+
+def test_where_no_photo_shows_the_scene_nothing_tells():
+    basis, (transmittance, addition) = box(0.7, border=0)
+    images = [transmittance * scene + addition for scene in scenes()]
+    assert artifact_light(images, [None] * 30, basis, (transmittance, addition)).explained == 0
+
+
+def test_each_overlay_has_the_light_of_its_own_photos():
+    made = Artifacts()
+    overlays = [ScreenSpaceOverlay(HEIGHT, WIDTH) for _ in range(2)]
+    (basis, (_, addition)), generator = box(1.0), torch.Generator().manual_seed(7)
+    for overlay in overlays:
+        overlay.initialize(torch.tensor([0.5, 0.4, 0.3]).expand(HEIGHT, WIDTH, 3), basis[..., :1], 1 - basis[..., :1])
+    groups = [0, 1, 2, 0, 1, 0, 1, 0, 1]
+    made.assign([*overlays, None], torch.ones(3, 6) * torch.arange(3)[:, None], groups, torch.zeros(3, 16))
+    logs = 0.1 * torch.randn(9, generator=generator)
+    cache = [
+        {"image": torch.where(basis[..., :1] > 0, addition * each.exp(), scene)}
+        for scene, each in zip(scenes(9), logs, strict=True)
+    ]
+    found = shading_at_start("auto", made, list("abcdefghi"), cache, None)
+    assert found is not None
+    assert found.photos == list("adfhbegi")
+    for rows, views in ((slice(0, 4), [0, 3, 5, 7]), (slice(4, 8), [1, 4, 6, 8])):
+        expected = (logs[views] - logs[views].mean())[:, None].expand(4, 3)
+        torch.testing.assert_close(found.coefficients[rows, :3].detach(), expected, atol=0.02, rtol=0)
+    assert found.of_view(2) is None
+
+
+def test_a_checkpoint_knows_photos_that_are_listed_twice(monkeypatch):
+    extra = {"photos": ["b", "a", "a"]}
+    state = {"_model.shading.coefficients": torch.rand(3, 5), "_model.shading._extra_state": extra}
+    monkeypatch.setattr(photo_shading, "load_pipeline_state", lambda path: state)
+    found = shading_at_start("auto", artifacts()[0], ["a", "a", "b"], None, Path("x.ckpt"))
+    assert found is not None
+    assert found.photos == ["b", "a", "a"]
+    extra["photos"] = ["b", "a", "a", "a"]
+    with pytest.raises(InputError, match="the shading of 4 photos, and 1 of them is missing"):
+        shading_at_start("auto", artifacts()[0], ["a", "a", "b"], None, Path("x.ckpt"))
+
+
+def test_gradients_of_several_steps_add_up():
+    own = shading()
+    for view in (0, 1, 1):
+        own.add_gradient(view, torch.ones(5).double())
+    assert own.coefficients.grad is not None
+    torch.testing.assert_close(own.coefficients.grad, torch.tensor([[1.0], [2]]).double().expand(2, 5))
+    own.coefficients.grad = None
+    own.add_gradient(0, torch.ones(5).double())
+    assert not own.coefficients.grad[1].any()
 
 
 def test_of_a_spot_the_scene_passes_for_light():
@@ -282,6 +383,11 @@ def test_a_light_that_is_the_same_in_all_photos_is_not_learned(train_resumable, 
     trainer = train_resumable(tmp_path / "scene", 1, {"overlay": "on", "num_downscales": 0})
     assert trainer.pipeline.model.shading is None
     assert "shading" not in trainer.optimizers.optimizers
+
+
+def test_photos_of_varying_exposure_do_not_tell(train):
+    assert train(steps=1, exposure="affine").pipeline.model.shading is None
+    assert train(steps=1, exposure="affine", shading="affine").pipeline.model.shading is not None
 
 
 def test_nothing_is_shaded_where_no_overlay_is_learned(train):
