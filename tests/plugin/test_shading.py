@@ -192,7 +192,9 @@ def test_gradients_of_several_steps_add_up():
     torch.testing.assert_close(own.coefficients.grad, torch.tensor([[1.0], [2]]).double().expand(2, 5))
     own.coefficients.grad = None
     own.add_gradient(0, torch.ones(5).double())
-    assert not own.coefficients.grad[1].any()
+    gradient = own.coefficients.grad
+    assert gradient is not None
+    assert not gradient[1].any()
 
 
 def test_of_a_spot_the_scene_passes_for_light():
