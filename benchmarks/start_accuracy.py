@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,12 +31,13 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initializ
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.scene_photos import scene_photos
-from ssa_nerfstudio.evidence.statistics import accumulate
+from ssa_nerfstudio.evidence.statistics import FULL_SCALE, accumulate
 from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.shading import shading_basis
+from ssa_nerfstudio.overlay.shading import light, shading_basis
 
+MEAN_LIGHT = "mean light"
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
 DETECTION = {
@@ -85,6 +86,8 @@ class Command:
     """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
     """Also halve and double each constant, of more seeds, too, of which their number is told."""
+    mean_light: bool = False
+    """Also estimate once more from photos of the mean light: without what `light` explains. Named so as a constant."""
     output: Annotated[Path, file_to_write()] | None = None
     """File to which every result is added, as a line of JSON. What it has is not measured again."""
 
@@ -105,6 +108,7 @@ class Command:
         groups = [*DETECTION.items(), *ESTIMATE.items(), *SEEDS.items()] if self.vary else []
         constants = [f"{module}.{name}" for module, names in groups for name in names]
         variants = [("", 1.0), *((name, factor) for name in constants for factor in (0.5, 2.0))]
+        variants += [(MEAN_LIGHT, 1.0)] * self.mean_light
         for path in self.data:
             missing = [variant for variant in variants if (path.name, *variant) not in known]
             for result in _measure(path, missing):
@@ -158,17 +162,22 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
-    def start(changed: bool) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
+    def start(changed: bool, views: list[View] = views) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
         detection = detect(statistics) if changed else plain
-        found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
+        own = guide if views is plain_views else guide_of(accumulate((view.image, view.mask) for view in views))
+        found = estimate(sample_points(points, views, own), own, detection.opaque, detection.mask)
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
-        initialize_from(overlay, found, guide, detection.mask)
+        initialize_from(overlay, found, own, detection.mask)
         return detection, found, overlay
 
+    plain_views = views
     own = None
     for constant, factor in variants:
         started, module, seeds = time.monotonic(), constant.split(".")[0], {}
-        if module in SEEDS or not constant:
+        if constant == MEAN_LIGHT:
+            _, _, overlay = own = own or start(False)
+            detection, found, overlay = start(False, _in_mean_light(views, overlay))
+        elif module in SEEDS or not constant:
             detection, found, overlay = own = own or start(False)
             layers = overlay.layers()
             with _scaled(constant, factor):
@@ -179,9 +188,9 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         else:
             with _scaled(constant, factor):
                 detection, found, overlay = start(module in DETECTION)
-            layers = overlay.layers()
+        layers = overlay.layers()
         images, masks = [view.image for view in views], [view.mask for view in views]
-        light = artifact_light(images, masks, shading_basis(1 - overlay.evidence), layers)
+        shading = artifact_light(images, masks, shading_basis(1 - overlay.evidence), layers)
         error = torch.cat(layers, dim=-1).detach() - truth
         size = error.abs()
         yield {
@@ -194,13 +203,27 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "T_off": _mean(size[~covered][:, 0]),
             "B_off": _mean(size[~covered][:, 1:]),
             "adds_light": found.adds_light(),
-            "light": round(light.explained, 3),
-            "hidden": round(light.hidden, 3),
+            "light": round(shading.explained, 3),
+            "hidden": round(shading.hidden, 3),
+            "noise": round(float(found.noise), 4),
             "verdict": detection.verdict,
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),
             **seeds,
         }
+
+
+def _in_mean_light(views: list[View], overlay: ScreenSpaceOverlay) -> list[View]:
+    """The views without what a light for each photo explains."""
+    basis, (transmittance, addition) = shading_basis(1 - overlay.evidence), overlay.layers()
+    images, masks = [view.image for view in views], [view.mask for view in views]
+    found = artifact_light(images, masks, basis, (transmittance, addition))
+    relit = []
+    for view, coefficients in zip(views, found.coefficients, strict=True):
+        change = (light(basis, coefficients) - 1) * addition
+        photo = view.image[..., :3].float() / FULL_SCALE.get(view.image.dtype, 1.0)
+        relit.append(replace(view, image=(photo - change.detach()).clamp(0, 1)))
+    return relit
 
 
 def _mean(values: torch.Tensor) -> float:

@@ -47,6 +47,18 @@ def test_what_is_not_drawn_on_a_clean_capture_is_an_error(write_built_in_scene, 
     assert row["verdict"] in capsys.readouterr().out
 
 
+def test_in_the_mean_light_a_start_is_nearer_to_the_truth(write_built_in_scene, tmp_path):
+    clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=96, height=72)
+    output = tmp_path / "errors.jsonl"
+    main(["simulate", "--data", str(clean), "--output", str(tmp_path / "finger"), "--effects", "finger"])
+    Command([tmp_path / "finger"], mean_light=True, output=output).run()
+    as_it_is, again = (json.loads(line) for line in output.read_text().splitlines())
+    assert again["constant"] == "mean light"
+    assert as_it_is["light"] > 0.05
+    assert again["noise"] < as_it_is["noise"]
+    assert again["B_on"] < as_it_is["B_on"]
+
+
 FOREIGN = '{"verdict": "none", "data": [1], "constant": "", "factor": 1}'
 
 
