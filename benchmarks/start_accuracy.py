@@ -25,7 +25,7 @@ from ssa_nerfstudio.cli.option_bounds import file_to_write
 from ssa_nerfstudio.data.sparse_points import check_points
 from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.artifact_light import artifact_light
+from ssa_nerfstudio.evidence.artifact_light import ArtifactLight, artifact_light
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
@@ -38,6 +38,7 @@ from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.shading import light, shading_basis
 
 MEAN_LIGHT = "mean light"
+"""In place of a constant: the start from photos without what a light for each explains."""
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
 DETECTION = {
@@ -162,36 +163,34 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
-    def start(changed: bool, views: list[View] = views) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
-        detection = detect(statistics) if changed else plain
-        own = guide if views is plain_views else guide_of(accumulate((view.image, view.mask) for view in views))
-        found = estimate(sample_points(points, views, own), own, detection.opaque, detection.mask)
+    def start(
+        detection: Detection, views: list[View], guide: torch.Tensor
+    ) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
+        found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
-        initialize_from(overlay, found, own, detection.mask)
+        initialize_from(overlay, found, guide, detection.mask)
         return detection, found, overlay
 
-    plain_views = views
     own = None
     for constant, factor in variants:
         started, module, seeds = time.monotonic(), constant.split(".")[0], {}
         if constant == MEAN_LIGHT:
-            _, _, overlay = own = own or start(False)
-            detection, found, overlay = start(False, _in_mean_light(views, overlay))
+            own = own or start(plain, views, guide)
+            relit = _in_mean_light(views, own[-1])
+            detection, found, overlay = start(plain, relit, guide_of(accumulate((v.image, v.mask) for v in relit)))
         elif module in SEEDS or not constant:
-            detection, found, overlay = own = own or start(False)
-            layers = overlay.layers()
+            detection, found, overlay = own = own or start(plain, views, guide)
             with _scaled(constant, factor):
-                photos = scene_photos(views, [layers] * len(views), [0] * len(views))
+                photos = scene_photos(views, [overlay.layers()] * len(views), [0] * len(views))
                 found_seeds = seeds_between(points, photos)
             counted = found_seeds.distant, found_seeds.gaps, found_seeds.backdrop
             seeds = {name: len(each) for name, each in zip(("seeds", "gaps", "backdrop"), counted, strict=True)}
         else:
             with _scaled(constant, factor):
-                detection, found, overlay = start(module in DETECTION)
-        layers = overlay.layers()
-        images, masks = [view.image for view in views], [view.mask for view in views]
-        shading = artifact_light(images, masks, shading_basis(1 - overlay.evidence), layers)
-        error = torch.cat(layers, dim=-1).detach() - truth
+                detected = detect(statistics) if module in DETECTION else plain
+                detection, found, overlay = start(detected, views, guide)
+        shading = _light_of(views, overlay)
+        error = torch.cat(overlay.layers(), dim=-1).detach() - truth
         size = error.abs()
         yield {
             "data": path.name,
@@ -213,13 +212,16 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         }
 
 
+def _light_of(views: list[View], overlay: ScreenSpaceOverlay) -> ArtifactLight:
+    images, masks = [view.image for view in views], [view.mask for view in views]
+    return artifact_light(images, masks, shading_basis(1 - overlay.evidence), overlay.layers())
+
+
 def _in_mean_light(views: list[View], overlay: ScreenSpaceOverlay) -> list[View]:
     """The views without what a light for each photo explains."""
-    basis, (transmittance, addition) = shading_basis(1 - overlay.evidence), overlay.layers()
-    images, masks = [view.image for view in views], [view.mask for view in views]
-    found = artifact_light(images, masks, basis, (transmittance, addition))
+    basis, (_, addition) = shading_basis(1 - overlay.evidence), overlay.layers()
     relit = []
-    for view, coefficients in zip(views, found.coefficients, strict=True):
+    for view, coefficients in zip(views, _light_of(views, overlay).coefficients, strict=True):
         change = (light(basis, coefficients) - 1) * addition
         photo = view.image[..., :3].float() / FULL_SCALE.get(view.image.dtype, 1.0)
         relit.append(replace(view, image=(photo - change.detach()).clamp(0, 1)))

@@ -4,10 +4,13 @@ does not."""
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+ShadingSetting = Literal["auto", "off", "affine"]
+"""Which photos have a light of their own: those of an artifact on which it changes, none, or all."""
 COEFFICIENTS = 5
 """Number of coefficients: logarithms of the gains of red, green and blue in the middle of an opaque artifact, and their
 change to the right and downwards per standard deviation of its extent. Less where less is opaque."""

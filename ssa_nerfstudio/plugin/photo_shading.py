@@ -7,7 +7,7 @@ for all photos leaves that unexplained, and the scene learns it where it comes t
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -20,13 +20,10 @@ from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
 from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.resampling import to_training_scale
-from ssa_nerfstudio.overlay.shading import COEFFICIENTS, light, shading_basis
+from ssa_nerfstudio.overlay.shading import COEFFICIENTS, ShadingSetting, light, shading_basis
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.decisions import tell
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
-
-Setting = Literal["auto", "off", "affine"]
-"""Which photos have a light of their own: those of an artifact on which it changes, none, or all."""
 
 
 class Shading(nn.Module):
@@ -99,7 +96,7 @@ class Shading(nn.Module):
 
 
 def shading_at_start(
-    setting: Setting,
+    setting: ShadingSetting,
     artifacts: Artifacts,
     names: list[str],
     cache: list[dict[str, Any]] | None,
@@ -128,7 +125,7 @@ def shading_at_start(
 
 
 def _shading_of_photos(
-    setting: Setting, artifacts: Artifacts, names: list[str], cache: list[dict[str, Any]] | None
+    setting: ShadingSetting, artifacts: Artifacts, names: list[str], cache: list[dict[str, Any]] | None
 ) -> Shading | None:
     """The shading of a training that begins."""
     if setting == "off" or not artifacts.learned():
@@ -156,17 +153,19 @@ def _shading_of_photos(
 
 
 def _light_at_start(
-    setting: Setting, overlay: ScreenSpaceOverlay, photos: list[dict[str, Any]] | None, count: int
+    setting: ShadingSetting, overlay: ScreenSpaceOverlay, photos: list[dict[str, Any]] | None, count: int
 ) -> Tensor | None:
     """Coefficients [count, 5] of an overlay's photos; None where they have the same light, as the setting goes."""
     if photos is None:
         return overlay.evidence.new_zeros(count, COEFFICIENTS) if setting == "affine" else None
 
+    basis = _basis(overlay, 1)
+
     def found(some: list[dict[str, Any]]) -> ArtifactLight:
         images, masks = [photo["image"] for photo in some], [photo.get("mask") for photo in some]
-        return artifact_light(images, masks, _basis(overlay, 1), overlay.layers())
+        return artifact_light(images, masks, basis, overlay.layers())
 
-    if setting == "auto" and hidden_share(_basis(overlay, 1)) < MIN_SHARE:
+    if setting == "auto" and hidden_share(basis) < MIN_SHARE:
         return None
     # Whether it changes, a regular subset tells.
     some = photos[:: -(-count // MAX_VIEWS)]
@@ -177,7 +176,7 @@ def _light_at_start(
 
 
 def _resumed_shading(
-    setting: Setting, artifacts: Artifacts, names: list[str], state: dict[str, Any], prefix: str
+    setting: ShadingSetting, artifacts: Artifacts, names: list[str], state: dict[str, Any], prefix: str
 ) -> Shading | None:
     """The shading of a training that goes on, with room for the coefficients in the pipeline's state."""
     saved = state.get(f"{prefix}coefficients")

@@ -8,6 +8,7 @@ from typing import ClassVar, Literal
 
 from nerfstudio.models.splatfacto import SplatfactoModelConfig
 
+from ssa_nerfstudio.overlay.shading import ShadingSetting
 from ssa_nerfstudio.overlay.sparsity import Sparsity
 from ssa_nerfstudio.rasterization import RasterizerName
 
@@ -46,7 +47,7 @@ class ModelSettings(SplatfactoModelConfig):
     """What exposure acts on. photo: on scene and artifact together, for an artifact on or in front of the lens; scene:
     on the scene alone, for what software drew into the finished photo; auto: as the photos' samples of the scene's
     points say, and photo where they say nothing."""
-    shading: Literal["auto", "off", "affine"] = "auto"
+    shading: ShadingSetting = "auto"
     """affine: learn the light on the artifact in each photo, a tint and a brightness whose logarithm changes linearly
     over it: for a finger, or a part of the camera's rig, that keeps its place in changing light. off: the artifact has
     the same light in all photos. auto: affine where the photos show that it changes, and no exposure is learned."""
