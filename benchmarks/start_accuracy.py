@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,16 +29,17 @@ from ssa_nerfstudio.evidence.artifact_light import ArtifactLight, artifact_light
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
+from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.scene_photos import scene_photos
-from ssa_nerfstudio.evidence.statistics import FULL_SCALE, accumulate
+from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
 from ssa_nerfstudio.experiments.runs.result_lines import read_lines
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.shading import light, shading_basis
+from ssa_nerfstudio.overlay.shading import basis_of
 
-MEAN_LIGHT = "mean light"
-"""In place of a constant: the start from photos without what a light for each explains."""
+FIRST = "first estimate"
+"""In place of a constant: the start without a second estimate in the artifact's mean light (`evidence.mean_light`)."""
 LAYERS = "layers/undistorted.npz"
 """Of a dataset in which an artifact was drawn: the truth."""
 DETECTION = {
@@ -87,8 +88,8 @@ class Command:
     """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
     """Also halve and double each constant, of more seeds, too, of which their number is told."""
-    mean_light: bool = False
-    """Also estimate once more from photos of the mean light: without what `light` explains. Named so as a constant."""
+    first: bool = False
+    """Also measure the first estimate alone, named so as a constant. A second one is made where the light changes."""
     output: Annotated[Path, file_to_write()] | None = None
     """File to which every result is added, as a line of JSON. What it has is not measured again."""
 
@@ -109,7 +110,7 @@ class Command:
         groups = [*DETECTION.items(), *ESTIMATE.items(), *SEEDS.items()] if self.vary else []
         constants = [f"{module}.{name}" for module, names in groups for name in names]
         variants = [("", 1.0), *((name, factor) for name in constants for factor in (0.5, 2.0))]
-        variants += [(MEAN_LIGHT, 1.0)] * self.mean_light
+        variants += [(FIRST, 1.0)] * self.first
         for path in self.data:
             missing = [variant for variant in variants if (path.name, *variant) not in known]
             for result in _measure(path, missing):
@@ -163,23 +164,22 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
-    def start(
-        detection: Detection, views: list[View], guide: torch.Tensor
-    ) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
-        found = estimate(sample_points(points, views, guide), guide, detection.opaque, detection.mask)
+    def start(detection: Detection, refine: bool = True) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
+        samples = sample_points(points, views, guide)
+        found = estimate(samples, guide, detection.opaque, detection.mask)
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
         initialize_from(overlay, found, guide, detection.mask)
+        if refine:
+            found = refine_in_mean_light(overlay, found, samples, guide, views, detection)
         return detection, found, overlay
 
     own = None
     for constant, factor in variants:
         started, module, seeds = time.monotonic(), constant.split(".")[0], {}
-        if constant == MEAN_LIGHT:
-            own = own or start(plain, views, guide)
-            relit = _in_mean_light(views, own[-1])
-            detection, found, overlay = start(plain, relit, guide_of(accumulate((v.image, v.mask) for v in relit)))
+        if constant == FIRST:
+            detection, found, overlay = start(plain, refine=False)
         elif module in SEEDS or not constant:
-            detection, found, overlay = own = own or start(plain, views, guide)
+            detection, found, overlay = own = own or start(plain)
             with _scaled(constant, factor):
                 photos = scene_photos(views, [overlay.layers()] * len(views), [0] * len(views))
                 found_seeds = seeds_between(points, photos)
@@ -188,7 +188,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         else:
             with _scaled(constant, factor):
                 detected = detect(statistics) if module in DETECTION else plain
-                detection, found, overlay = start(detected, views, guide)
+                detection, found, overlay = start(detected)
         shading = _light_of(views, overlay)
         error = torch.cat(overlay.layers(), dim=-1).detach() - truth
         size = error.abs()
@@ -214,18 +214,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
 
 def _light_of(views: list[View], overlay: ScreenSpaceOverlay) -> ArtifactLight:
     images, masks = [view.image for view in views], [view.mask for view in views]
-    return artifact_light(images, masks, shading_basis(1 - overlay.evidence), overlay.layers())
-
-
-def _in_mean_light(views: list[View], overlay: ScreenSpaceOverlay) -> list[View]:
-    """The views without what a light for each photo explains."""
-    basis, (_, addition) = shading_basis(1 - overlay.evidence), overlay.layers()
-    relit = []
-    for view, coefficients in zip(views, _light_of(views, overlay).coefficients, strict=True):
-        change = (light(basis, coefficients) - 1) * addition
-        photo = view.image[..., :3].float() / FULL_SCALE.get(view.image.dtype, 1.0)
-        relit.append(replace(view, image=(photo - change.detach()).clamp(0, 1)))
-    return relit
+    return artifact_light(images, masks, basis_of(overlay), overlay.layers())
 
 
 def _mean(values: torch.Tensor) -> float:

@@ -11,6 +11,7 @@ from torch import Tensor
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, MIN_SHARE
 from ssa_nerfstudio.evidence.point_samples import working_reduction
+from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS
 
@@ -83,8 +84,8 @@ def artifact_light(
     addition = addition.reshape(-1, 3)[pixels]
     through = transmittance.mean(dim=-1).reshape(-1, 1)[pixels].expand(-1, 3)
     # [N, 3 channels, 5] each: a gain for each channel, slopes for all.
-    of_light = _terms(addition * own, addition, slopes)
-    of_scene = _terms(through, through, slopes / own)
+    of_light = affine_terms(addition * own, addition, slopes)
+    of_scene = affine_terms(through, through, slopes / own)
     terms = torch.cat([of_light, of_scene], dim=-1).double()
     shown, weights = _samples(images, masks, pixels, reduction)
     mean = (weights * shown).sum(dim=0) / weights.sum(dim=0).clamp_min(1)
@@ -104,7 +105,34 @@ def artifact_light(
     return ArtifactLight(found, explained, hidden)
 
 
-def hidden_share(basis: Tensor) -> float:
+def changing_light(
+    images: Sequence[Tensor], masks: Sequence[Tensor | None], basis: Tensor, layers: tuple[Tensor, Tensor]
+) -> Tensor | None:
+    """The coefficients [V, COEFFICIENTS] of each photo's light; None where it is the same in all (`artifact_light`).
+
+    Whether it changes, a regular subset of MAX_VIEWS photos tells, so that few are read where it does not.
+    """
+    if _hidden_share(basis) < MIN_SHARE:
+        return None
+    some = slice(None, None, -(-len(images) // MAX_VIEWS))
+    found = artifact_light(images[some], masks[some], basis, layers)
+    if not found.changes or len(found.coefficients) == len(images):
+        return found.coefficients if found.changes else None
+    found = artifact_light(images, masks, basis, layers)
+    return found.coefficients if found.changes else None
+
+
+def affine_terms(of_gains: Tensor, of_slopes: Tensor, slopes: Tensor) -> Tensor:
+    """[N, 3, 5]: what a photo's coefficients are multiplied by at a pixel and in a channel.
+
+    Args:
+        of_gains, of_slopes: factors of both [N, 3].
+        slopes: [N, 2].
+    """
+    return torch.cat([torch.diag_embed(of_gains), of_slopes[..., None] * slopes[:, None]], dim=-1)
+
+
+def _hidden_share(basis: Tensor) -> float:
     """Share of the frame that counts (`ArtifactLight.hidden`), given [H, W, 3] (`overlay.shading.shading_basis`)."""
     return float((reduced(basis[..., :1], working_reduction(*basis.shape[:2])) > HIDING).float().mean())
 
@@ -127,16 +155,6 @@ def _share_of_light(products: Tensor, sums: Tensor, total: Tensor, bound: float,
         float((sums[:, part] * _solved(products, sums, part)).sum()) for part in (_LIGHT, _SCENE, slice(None))
     )
     return min(max(alone, together - other_scene, 0.0) / max(left, 1e-12), 1.0)
-
-
-def _terms(of_gains: Tensor, of_slopes: Tensor, slopes: Tensor) -> Tensor:
-    """[N, 3, 5]: what a photo's coefficients are multiplied by at a pixel and in a channel.
-
-    Args:
-        of_gains, of_slopes: factors of both [N, 3].
-        slopes: [N, 2].
-    """
-    return torch.cat([torch.diag_embed(of_gains), of_slopes[..., None] * slopes[:, None]], dim=-1)
 
 
 def _solved(products: Tensor, sums: Tensor, part: slice) -> Tensor:

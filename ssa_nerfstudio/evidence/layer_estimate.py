@@ -63,6 +63,8 @@ class LayerEstimate:
     """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers; NaN without any."""
     noise: Tensor = field(default_factory=lambda: torch.ones(()))
     """Robust deviation of the samples from layers and colors before the last turn, [] in (0, 1]; 1: unknown."""
+    colors: Tensor | None = None
+    """Of the points, [N, 3] in [0, 1]; None: unknown."""
 
     def opacity(self) -> Tensor:
         """The least matte [h, w, 1] that explains T and B."""
@@ -152,7 +154,7 @@ def estimate_layers(
     around = local_mean(summed(pixel, counts, height * width).reshape(height, width, 2), OCCLUSION_RADIUS)
     unexplained = around[..., :1] / around[..., 1:]  # 0 / 0 is NaN
     return LayerEstimate(
-        layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained, scale.clamp_max(1.0)
+        layers[..., :1], layers[..., 1:], torch.ones_like(layers[..., :1]), unexplained, scale.clamp_max(1.0), colors
     )
 
 

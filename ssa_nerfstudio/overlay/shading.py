@@ -9,6 +9,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.resampling import to_training_scale
+
 ShadingSetting = Literal["auto", "off", "affine"]
 """Which photos have a light of their own: those of an artifact on which it changes, none, or all."""
 COEFFICIENTS = 5
@@ -36,6 +39,20 @@ def shading_basis(opacity: Tensor) -> Tensor:
         deviation = ((opacity * offset.square()).sum() / total).sqrt().clamp_min(0.5)  # of an artifact of one pixel
         coordinates.append((offset / deviation).clamp(-_HALF_WIDTH, _HALF_WIDTH).expand_as(opacity))
     return torch.cat([opacity, *(opacity * each for each in coordinates)], dim=-1)
+
+
+def basis_of(overlay: ScreenSpaceOverlay, reduction: int = 1) -> Tensor:
+    """The basis of an overlay's opacity as the training started, which checkpoints hold.
+
+    Args:
+        overlay: the artifact's.
+        reduction: factor by which training images are reduced.
+
+    Returns:
+        [H // reduction, W // reduction, 3], see `shading_basis`.
+    """
+    basis = shading_basis(1 - overlay.evidence)
+    return to_training_scale(basis, overlay.resolution, reduction, overlay.height, overlay.width)
 
 
 def light(basis: Tensor, coefficients: Tensor) -> Tensor:

@@ -23,6 +23,7 @@ from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, ignore_changing, initialize, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
+from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
@@ -192,8 +193,8 @@ def _learned_overlay(
     detection, guide = detect(statistics, known=bool(known)), guide_of(statistics)
     found = None
     if points is not None and (config.overlay == "auto" or by_points):
-        device = part.images[0]["image"].device
-        samples = sample_points(points.to(device), views_of(part.images, part.cameras, part.gains), guide)
+        device, views = part.images[0]["image"].device, views_of(part.images, part.cameras, part.gains)
+        samples = sample_points(points.to(device), views, guide)
         found = estimate(samples, guide, detection.opaque, detection.mask) if len(samples.point) else None
     if config.overlay == "auto":
         share = 0.0 if found is None else found.share()
@@ -206,6 +207,8 @@ def _learned_overlay(
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide, detection.mask)
+        if config.shading != "off" and part.gains is None:
+            found = refine_in_mean_light(started, found, samples, guide, views, detection)
         if config.ignore_changing:
             ignore_changing(started, found)
         return started

@@ -15,12 +15,9 @@ from torch.nn import Parameter
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, ArtifactLight, artifact_light, hidden_share
-from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
-from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
+from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, artifact_light, changing_light
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
-from ssa_nerfstudio.overlay.resampling import to_training_scale
-from ssa_nerfstudio.overlay.shading import COEFFICIENTS, ShadingSetting, light, shading_basis
+from ssa_nerfstudio.overlay.shading import COEFFICIENTS, ShadingSetting, basis_of, light
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.decisions import tell
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
@@ -69,7 +66,7 @@ class Shading(nn.Module):
         if key not in self._bases:
             # Of one resolution: that of a training only rises.
             self._bases = {known: basis for known, basis in self._bases.items() if known[1] == reduction}
-            self._bases[key] = _basis(overlay, reduction)
+            self._bases[key] = basis_of(overlay, reduction)
         return light(self._bases[key], coefficients)
 
     def add_gradient(self, view: int, gradient: Tensor) -> None:
@@ -159,20 +156,11 @@ def _light_at_start(
     if photos is None:
         return overlay.evidence.new_zeros(count, COEFFICIENTS) if setting == "affine" else None
 
-    basis = _basis(overlay, 1)
-
-    def found(some: list[dict[str, Any]]) -> ArtifactLight:
-        images, masks = [photo["image"] for photo in some], [photo.get("mask") for photo in some]
-        return artifact_light(images, masks, basis, overlay.layers())
-
-    if setting == "auto" and hidden_share(basis) < MIN_SHARE:
-        return None
-    # Whether it changes, a regular subset tells.
-    some = photos[:: -(-count // MAX_VIEWS)]
-    if setting == "auto" and len(some) < count and not found(some).changes:
-        return None
-    light = found(photos)
-    return light.coefficients if setting == "affine" or light.changes else None
+    images, masks = [photo["image"] for photo in photos], [photo.get("mask") for photo in photos]
+    basis, layers = basis_of(overlay), overlay.layers()
+    if setting == "auto":
+        return changing_light(images, masks, basis, layers)
+    return artifact_light(images, masks, basis, layers).coefficients
 
 
 def _resumed_shading(
@@ -203,9 +191,3 @@ def _resumed_shading(
     groups = [artifacts.group_of_view(view) for view in found]
     views = {view: bare if group is None else group for view, group in zip(found, groups, strict=True)}
     return Shading(views, names, torch.zeros_like(saved, device=artifacts.learned()[0].evidence.device))
-
-
-def _basis(overlay: ScreenSpaceOverlay, reduction: int) -> Tensor:
-    """[H // reduction, W // reduction, 3] of the overlay's opacity as the training started, which checkpoints hold."""
-    basis = shading_basis(1 - overlay.evidence)
-    return to_training_scale(basis, overlay.resolution, reduction, overlay.height, overlay.width)

@@ -51,12 +51,12 @@ def test_in_the_mean_light_a_start_is_nearer_to_the_truth(write_built_in_scene, 
     clean = write_built_in_scene(tmp_path / "clean", None, views=12, test_views=3, width=96, height=72)
     output = tmp_path / "errors.jsonl"
     main(["simulate", "--data", str(clean), "--output", str(tmp_path / "finger"), "--effects", "finger"])
-    Command([tmp_path / "finger"], mean_light=True, output=output).run()
-    as_it_is, again = (json.loads(line) for line in output.read_text().splitlines())
-    assert again["constant"] == "mean light"
-    assert as_it_is["light"] > 0.05
-    assert again["noise"] < as_it_is["noise"]
-    assert again["B_on"] < as_it_is["B_on"]
+    Command([tmp_path / "finger"], first=True, output=output).run()
+    start, first = (json.loads(line) for line in output.read_text().splitlines())
+    assert [start["constant"], first["constant"]] == ["", "first estimate"]
+    assert first["light"] > 0.05
+    assert start["noise"] < first["noise"]
+    assert start["B_on"] < first["B_on"]
 
 
 FOREIGN = '{"verdict": "none", "data": [1], "constant": "", "factor": 1}'

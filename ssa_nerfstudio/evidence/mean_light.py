@@ -1,0 +1,138 @@
+"""A second estimate of an artifact on which the light changes, from samples in its mean light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from ssa_nerfstudio.evidence.artifact_light import HIDING, MAX_COEFFICIENT, affine_terms, changing_light
+from ssa_nerfstudio.evidence.detection import Detection
+from ssa_nerfstudio.evidence.guided_upsampling import reduced
+from ssa_nerfstudio.evidence.initialization import estimate, initialize_from
+from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE, LayerEstimate, robust_deviation
+from ssa_nerfstudio.evidence.point_samples import PointSamples, View, summed, working_reduction
+from ssa_nerfstudio.evidence.statistics import UNKNOWN_DEVIATION
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.shading import COEFFICIENTS, basis_of
+
+ROUNDS = 3
+"""Of robust least squares."""
+
+
+@torch.no_grad()
+def refine_in_mean_light(
+    overlay: ScreenSpaceOverlay,
+    found: LayerEstimate,
+    samples: PointSamples,
+    guide: Tensor,
+    views: Sequence[View],
+    detection: Detection,
+) -> LayerEstimate:
+    """Estimate the layers once more where the light on them changes, and initialize the overlay from them.
+
+    To an estimate, changes of the light are noise, and some of it passes for scene. The colors of the points tell them
+    apart: what the first estimate leaves of the samples is fitted by a light for each view, and the second is of the
+    samples without it. It holds where it leaves less noise. Where an artifact moves, some of that passes for light, and
+    it leaves more.
+
+    Args:
+        overlay: initialized from `found`; changed in place where the second estimate holds.
+        found: the first estimate.
+        samples: that it is of.
+        guide: of the photos (`initialization.guide_of`).
+        views: the photos, that all show the artifact.
+        detection: from the same photos.
+
+    Returns:
+        The estimate that holds.
+    """
+    device = samples.color.device
+    basis, (transmittance, addition) = basis_of(overlay).to(device), (layer.to(device) for layer in overlay.layers())
+    images, masks = [view.image for view in views], [view.mask for view in views]
+    if found.colors is None or changing_light(images, masks, basis, (transmittance, addition)) is None:
+        return found
+    reduction = working_reduction(overlay.height, overlay.width)
+    coefficients = light_of_samples(samples, found, reduced(basis, reduction), len(views))
+    relit = _in_mean_light(samples, found, reduced(basis, reduction), coefficients)
+    guide = _guide_in_mean_light(guide.to(device), basis, addition, coefficients)
+    second = estimate(relit, guide, detection.opaque, detection.mask)
+    if second.noise >= found.noise:
+        return found
+    initialize_from(overlay, second, guide, detection.mask)
+    return second
+
+
+def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor, views: int) -> Tensor:
+    """Fit the light of each view to what an estimate leaves of the samples.
+
+    By robust least squares, I - F (T C + B) = F B (basis coefficients_i), the linear part of the light, over samples
+    where the artifact hides more than it shows. A view with few of them has a light near the mean, because coefficients
+    are expected within MAX_COEFFICIENT.
+
+    Args:
+        samples: of the points.
+        found: an estimate from them, with the points' colors.
+        basis: [h, w, 3] at the working resolution (`overlay.shading.shading_basis`).
+        views: their number V.
+
+    Returns:
+        Coefficients [V, COEFFICIENTS], of mean 0 over the views.
+    """
+    assert found.colors is not None
+    hides = (basis.reshape(-1, 3)[samples.pixel, 0] > HIDING).nonzero()[:, 0]
+    pixel, view, observed = samples.pixel[hides], samples.view[hides], samples.color[hides]
+    behind = found.transmittance.reshape(-1, 1)[pixel] * found.colors[samples.point[hides]]
+    falloff, addition = found.falloff.reshape(-1, 1)[pixel], found.addition.reshape(-1, 3)[pixel]
+    left, terms = observed - falloff * (behind + addition), _terms(basis, found, pixel)
+    coefficients = observed.new_zeros(views, COEFFICIENTS)
+    expected = torch.eye(COEFFICIENTS, device=left.device, dtype=torch.float64) / MAX_COEFFICIENT**2
+    for _ in range(ROUNDS if len(hides) else 0):
+        residual = left - _change(terms, coefficients[view])
+        scale = robust_deviation(residual)
+        weight = 1 / (1 + residual.square().mean(dim=-1) / (OUTLIER_SCALE * scale) ** 2)
+        precision = (weight / scale**2)[:, None, None] * terms
+        products = summed(view, (precision.mT @ terms).flatten(1).double(), views).unflatten(1, (COEFFICIENTS, -1))
+        sums = summed(view, (precision * left[..., None]).sum(dim=1).double(), views)
+        coefficients = torch.linalg.solve(products + expected, sums).to(left)
+    coefficients = coefficients.clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT)
+    return coefficients - coefficients.mean(dim=0)
+
+
+def _in_mean_light(samples: PointSamples, found: LayerEstimate, basis: Tensor, coefficients: Tensor) -> PointSamples:
+    change = _change(_terms(basis, found, samples.pixel), coefficients[samples.view])
+    return replace(samples, color=(samples.color - change).clamp(0, 1)).ordered()
+
+
+def _guide_in_mean_light(guide: Tensor, basis: Tensor, addition: Tensor, coefficients: Tensor) -> Tensor:
+    """Mean and deviation of the photos [H, W, 4] in the mean light, of which their mean is.
+
+    Args:
+        guide: those of the photos as they are.
+        basis: [H, W, 3].
+        addition: B, likewise.
+        coefficients: of the photos [V, COEFFICIENTS].
+    """
+    deviation = guide[..., 3:]
+    gains, slopes = coefficients.split((3, 2), dim=1)
+    variance = torch.zeros_like(deviation)
+    for channel in range(3):
+        covariance = torch.cov(torch.cat([gains[:, channel, None], slopes], dim=1).T, correction=0)
+        own = addition[..., channel, None].square() * (basis @ covariance * basis).sum(dim=-1, keepdim=True)
+        variance = torch.maximum(variance, own)
+    steady = (deviation.square() - variance).clamp_min(0).sqrt()
+    return torch.cat([guide[..., :3], torch.where(deviation == UNKNOWN_DEVIATION, deviation, steady)], dim=-1)
+
+
+def _terms(basis: Tensor, found: LayerEstimate, pixel: Tensor) -> Tensor:
+    """[S, 3, COEFFICIENTS]: what a view's coefficients are multiplied by at working pixels [S]."""
+    addition = (found.falloff * found.addition).reshape(-1, 3)[pixel]
+    own, slopes = basis.reshape(-1, 3)[pixel].split((1, 2), dim=-1)
+    return affine_terms(addition * own, addition, slopes)
+
+
+def _change(terms: Tensor, coefficients: Tensor) -> Tensor:
+    """Change of colors [S, 3] by coefficients [S, COEFFICIENTS]."""
+    return (terms @ coefficients[..., None])[..., 0]
