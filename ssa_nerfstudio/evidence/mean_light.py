@@ -18,8 +18,8 @@ from ssa_nerfstudio.evidence.statistics import UNKNOWN_DEVIATION
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS, basis_of
 
-ROUNDS = 3
-"""Of robust least squares."""
+ROUNDS = 6
+"""Of robust least squares, each with the variance that the coefficients of the round before have."""
 
 
 @torch.no_grad()
@@ -69,8 +69,8 @@ def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor,
     """Fit the light of each view to what an estimate leaves of the samples.
 
     By robust least squares, I - F (T C + B) = F B (basis coefficients_i), the linear part of the light, over samples
-    where the artifact hides more than it shows. A view with few of them has a light near the mean, because coefficients
-    are expected within MAX_COEFFICIENT.
+    where the artifact hides more than it shows. Coefficients are expected to vary as those of all views do (empirical
+    Bayes), so that a view with few samples has a light near the mean.
 
     Args:
         samples: of the points.
@@ -88,7 +88,7 @@ def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor,
     falloff, addition = found.falloff.reshape(-1, 1)[pixel], found.addition.reshape(-1, 3)[pixel]
     left, terms = observed - falloff * (behind + addition), _terms(basis, found, pixel)
     coefficients = observed.new_zeros(views, COEFFICIENTS)
-    expected = torch.eye(COEFFICIENTS, device=left.device, dtype=torch.float64) / MAX_COEFFICIENT**2
+    variance = torch.full((COEFFICIENTS,), MAX_COEFFICIENT**2, device=left.device, dtype=torch.float64)
     for _ in range(ROUNDS if len(hides) else 0):
         residual = left - _change(terms, coefficients[view])
         scale = robust_deviation(residual)
@@ -96,7 +96,10 @@ def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor,
         precision = (weight / scale**2)[:, None, None] * terms
         products = summed(view, (precision.mT @ terms).flatten(1).double(), views).unflatten(1, (COEFFICIENTS, -1))
         sums = summed(view, (precision * left[..., None]).sum(dim=1).double(), views)
-        coefficients = torch.linalg.solve(products + expected, sums).to(left)
+        uncertainty = torch.linalg.inv(products + torch.diag(1 / variance))
+        solution = (uncertainty @ sums[..., None])[..., 0]
+        variance = (solution.square() + uncertainty.diagonal(dim1=1, dim2=2)).mean(dim=0)
+        coefficients = solution.to(left)
     coefficients = coefficients.clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT)
     return coefficients - coefficients.mean(dim=0)
 
