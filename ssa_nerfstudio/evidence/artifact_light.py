@@ -55,8 +55,9 @@ def artifact_light(
 ) -> ArtifactLight:
     """Fit the coefficients of each photo's shading, and judge whether there is any.
 
-    By least squares, I_i - mean(I) = B (basis coefficients_i), the linear part of the light. What the scene changes
-    where it comes through is taken for light, too, so these are a start and no more.
+    By least squares, I_i - mean(I) = B (basis coefficients_i), the linear part of the light. Where the scene comes
+    through, it changes the photos in proportion to T, which is not known better than MIN_OPACITY. So squares are divided
+    by T^2 + MIN_OPACITY^2.
 
     Light is judged beside a scene of as many coefficients, T (own gains and slopes of the photo), each at most
     SCENE_DEVIATIONS of the scene's own: of the squares that the scene leaves, the share that light explains, alone or
@@ -90,10 +91,9 @@ def artifact_light(
     shown, weights = _samples(images, masks, pixels, reduction)
     mean = (weights * shown).sum(dim=0) / weights.sum(dim=0).clamp_min(1)
     change = (weights * (shown - mean)).double()
-    squares = torch.einsum("nci,ncj->nij", terms, terms)  # once: for each photo it would be large
-    products = torch.einsum("vn,nij->vij", weights[..., 0].double(), squares).cpu()
-    sums = torch.einsum("vnc,nci->vi", change, terms).cpu()
-    found = _solved(products, sums, _LIGHT).clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
+    precision = 1 / (through[:, 0].square() + MIN_OPACITY**2)
+    found = _solved(*_normal_equations(terms[..., _LIGHT], change, precision * weights[..., 0]))
+    found = found.clamp(-MAX_COEFFICIENT, MAX_COEFFICIENT).to(basis)
     found = found - found.mean(dim=0)
     behind, shows = _samples(images, masks, others, reduction)
     if 1 - hidden < MIN_SHARE or not shows.any():
@@ -101,6 +101,7 @@ def artifact_light(
     mean = (shows * behind).sum(dim=0) / shows.sum(dim=0).clamp_min(1)
     variance = float((shows * (behind - mean).square()).sum() / (3 * shows.sum()))
     uncertain = 3 * float(weights.sum()) * MIN_OPACITY**2 * variance
+    products, sums = _normal_equations(terms, change, weights[..., 0])
     explained = _share_of_light(products, sums, change.square().sum(), SCENE_DEVIATIONS * variance**0.5, uncertain)
     return ArtifactLight(found, explained, hidden)
 
@@ -157,7 +158,14 @@ def _share_of_light(products: Tensor, sums: Tensor, total: Tensor, bound: float,
     return min(max(alone, together - other_scene, 0.0) / max(left, 1e-12), 1.0)
 
 
-def _solved(products: Tensor, sums: Tensor, part: slice) -> Tensor:
+def _normal_equations(terms: Tensor, change: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Products [V, K, K] and sums [V, K] of terms [N, 3, K] and changes [V, N, 3] under weights [V, N]; on the CPU."""
+    squares = torch.einsum("nci,ncj->nij", terms, terms)  # once: for each photo it would be large
+    products = torch.einsum("vn,nij->vij", weights.to(terms), squares)
+    return products.cpu(), torch.einsum("vnc,nci->vi", weights.to(terms)[..., None] * change, terms).cpu()
+
+
+def _solved(products: Tensor, sums: Tensor, part: slice = slice(None)) -> Tensor:
     """Coefficients [V, K] of a part of the terms alone."""
     products = products[:, part, part]
     ridge = 1e-6 * products.diagonal(dim1=1, dim2=2).amax(dim=1).clamp_min(1e-12)
