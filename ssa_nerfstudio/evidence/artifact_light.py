@@ -56,8 +56,8 @@ def artifact_light(
     """Fit the coefficients of each photo's shading, and judge whether there is any.
 
     By least squares, I_i - mean(I) = B (basis coefficients_i), the linear part of the light. Where the scene comes
-    through, it changes the photos in proportion to T, which is not known better than MIN_OPACITY. So squares are divided
-    by T^2 + MIN_OPACITY^2.
+    through, it changes the photos in proportion to T, which is not known better than MIN_OPACITY. So squares are
+    divided by T^2 + MIN_OPACITY^2.
 
     Light is judged beside a scene of as many coefficients, T (own gains and slopes of the photo), each at most
     SCENE_DEVIATIONS of the scene's own: of the squares that the scene leaves, the share that light explains, alone or

@@ -95,6 +95,22 @@ def test_what_the_scene_explains_is_no_light(brightness):
         assert found.coefficients.abs().max() > 0.03  # by itself it would pass for light
 
 
+def test_the_start_trusts_what_lets_least_of_the_scene_through():
+    """Of a core and a rim; with both alike the error would be 0.036."""
+    made = torch.zeros(HEIGHT, WIDTH, 1)
+    made[10:30, 10:50], made[12:28, 14:46] = 0.6, 1.0
+    layers = 1 - made, made * torch.tensor([0.5, 0.4, 0.3])
+    basis, gains = shading_basis(made), torch.tensor([0.1, 0.1, 0.1, 0.0, 0.0])
+    own = torch.randn(30, 4, generator=torch.Generator().manual_seed(7))
+    images = [
+        layers[0] * tinted(torch.full((HEIGHT, WIDTH, 3), 0.5), each) + light(basis, (-1) ** view * gains) * layers[1]
+        for view, each in enumerate(own)
+    ]
+    found = artifact_light(images, [None] * 30, basis, layers).coefficients
+    expected = torch.stack([(-1) ** view * gains for view in range(30)])
+    assert (found - expected)[:, :3].square().mean().sqrt() < 0.005
+
+
 def box(matte: float, border: int = 10) -> tuple[torch.Tensor, tuple[torch.Tensor, torch.Tensor]]:
     """The basis and the layers of an artifact of one color that leaves a border of the frame clear."""
     made = torch.zeros(HEIGHT, WIDTH, 1)
