@@ -106,21 +106,16 @@ def artifact_light(
     return ArtifactLight(found, explained, hidden)
 
 
-def changing_light(
+def light_changes(
     images: Sequence[Tensor], masks: Sequence[Tensor | None], basis: Tensor, layers: tuple[Tensor, Tensor]
-) -> Tensor | None:
-    """The coefficients [V, COEFFICIENTS] of each photo's light; None where it is the same in all (`artifact_light`).
+) -> bool:
+    """Whether the light is not the same in all photos, as a regular subset of at most MAX_VIEWS tells.
 
-    Whether it changes, a regular subset of MAX_VIEWS photos tells, so that few are read where it does not.
+    Args:
+        images, masks, basis, layers: as for `artifact_light`.
     """
-    if _hidden_share(basis) < MIN_SHARE:
-        return None
     some = slice(None, None, -(-len(images) // MAX_VIEWS))
-    found = artifact_light(images[some], masks[some], basis, layers)
-    if not found.changes or len(found.coefficients) == len(images):
-        return found.coefficients if found.changes else None
-    found = artifact_light(images, masks, basis, layers)
-    return found.coefficients if found.changes else None
+    return _hidden_share(basis) >= MIN_SHARE and artifact_light(images[some], masks[some], basis, layers).changes
 
 
 def affine_terms(of_gains: Tensor, of_slopes: Tensor, slopes: Tensor) -> Tensor:

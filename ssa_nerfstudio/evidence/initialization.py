@@ -48,7 +48,9 @@ def initialize(overlay: ScreenSpaceOverlay, statistics: ImageStatistics, within:
     overlay.initialize(addition / alpha, alpha, 1 - alpha)
 
 
-def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tensor) -> LayerEstimate:
+def estimate(
+    samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tensor, falloff: Tensor | None = None
+) -> LayerEstimate:
     """Estimate an artifact's layers from samples of the scene's points.
 
     Args:
@@ -57,6 +59,7 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tenso
         opaque: [H, W] bool: where static edges enclose something opaque (`Detection.opaque`), which holds where no
             point says otherwise.
         static: [H, W] bool: where static edges are (`Detection.mask`): clear and opaque are equally likely there.
+        falloff: of the lens, [h, w, 1], if it is known; None: it is estimated from the samples.
     """
     reduction = working_reduction(*guide.shape[:2])
     # Photos that vary nowhere show no scene.
@@ -64,7 +67,7 @@ def estimate(samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tenso
     areas = torch.stack([hidden, static.to(guide.device)], dim=-1).to(guide)
     mean, deviation = reduced(guide[..., :3], reduction), reduced_deviation(guide[..., 3:], reduction)
     photos = torch.cat([mean, deviation, reduced(areas, reduction)], dim=-1).to(samples.color.device)
-    falloff = estimate_falloff(samples)
+    falloff = estimate_falloff(samples) if falloff is None else falloff
     if (falloff < 1).any():
         photos[..., :4] /= falloff
         samples = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
