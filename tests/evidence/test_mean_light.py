@@ -102,6 +102,17 @@ def test_where_the_light_changes_a_second_estimate_is_nearer_to_the_truth():
     assert start.overlay.noise == second.noise
 
 
+def test_the_second_estimate_is_told_how_much_photos_vary_without_the_light(monkeypatch):
+    start, told = Start(views(changing())), []
+    monkeypatch.setattr(
+        mean_light, "estimate", lambda samples, guide, *others: told.append(guide) or estimate(samples, guide, *others)
+    )
+    start.refined()
+    hidden = slice(None), slice(0, WIDTH // 3 - 2), 3
+    assert told[0][hidden].mean() < 0.8 * start.guide[hidden].mean()
+    torch.testing.assert_close(told[0][:, WIDTH // 2 :], start.guide[:, WIDTH // 2 :])
+
+
 def test_in_constant_light_the_first_estimate_holds():
     start = Start(views(CONSTANT))
     before = {name: value.clone() for name, value in start.overlay.state_dict().items()}

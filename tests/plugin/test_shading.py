@@ -15,7 +15,7 @@ from ssa_nerfstudio.evidence import artifact_light as evidence_of_light
 from ssa_nerfstudio.evidence.artifact_light import artifact_light
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.shading import light, shading_basis
-from ssa_nerfstudio.plugin import photo_shading
+from ssa_nerfstudio.plugin import overlay_setup, photo_shading
 from ssa_nerfstudio.plugin.artifacts import Artifacts
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel
 from ssa_nerfstudio.plugin.photo_formation import predicted_photo
@@ -402,6 +402,20 @@ def test_a_light_that_is_the_same_in_all_photos_is_not_learned(train_resumable, 
     trainer = train_resumable(tmp_path / "scene", 1, {"overlay": "on", "num_downscales": 0})
     assert trainer.pipeline.model.shading is None
     assert "shading" not in trainer.optimizers.optimizers
+
+
+@pytest.mark.parametrize(
+    ("model", "times"), [({}, 1), ({"shading": "affine"}, 1), ({"shading": "off"}, 0), ({"exposure": "affine"}, 0)]
+)
+def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypatch, model, times):
+    seen, unlike = [], []
+    monkeypatch.setattr(overlay_setup, "ignore_changing", lambda overlay, found: unlike.append(found))
+    monkeypatch.setattr(
+        overlay_setup, "refine_in_mean_light", lambda overlay, found, *others: seen.append(found) or "second"
+    )
+    train(steps=1, **model)
+    assert len(seen) == times
+    assert unlike == ["second"] * times or not times
 
 
 def test_photos_of_varying_exposure_do_not_tell(train):
