@@ -1,7 +1,8 @@
 """Error of the start against the artifact that was simulated: `python benchmarks/start_accuracy.py --data DIR`
 
 Of clean datasets it is the error where nothing is in front. `light`: how much of what the scene leaves unexplained a
-light for each photo explains, over the share `hidden` of the frame (`evidence.artifact_light`).
+light for each photo explains, over the share `hidden` of the frame (`evidence.artifact_light`); `left`: what a second
+estimate leaves of the squares that the first leaves there (`evidence.mean_light`).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from ssa_nerfstudio.evidence.artifact_light import ArtifactLight, artifact_light
 from ssa_nerfstudio.evidence.detection import Detection, detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
-from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light
+from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light, second_estimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.scene_photos import scene_photos
 from ssa_nerfstudio.evidence.statistics import accumulate
@@ -164,6 +165,8 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
+    second: dict[str, float] = {}  # what a second estimate would leave, beside the first
+
     def start(detection: Detection, refine: bool = True) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
         samples = sample_points(points, views, guide)
         found = estimate(samples, guide, detection.opaque, detection.mask)
@@ -171,6 +174,8 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         initialize_from(overlay, found, guide, detection.mask)
         if refine:
             found = refine_in_mean_light(overlay, found, samples, guide, views, detection)
+        elif (again := second_estimate(overlay, found, samples, guide, views, detection)) is not None:
+            second["left"] = round(again.left, 3)
         return detection, found, overlay
 
     own = None
@@ -208,6 +213,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "verdict": detection.verdict,
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),
+            **(second if constant == FIRST else {}),
             **seeds,
         }
 

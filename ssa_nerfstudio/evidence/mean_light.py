@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -25,7 +25,18 @@ MOST_LEFT = 0.5
 makes a difference leave 0.07 to 0.31, occlusions, a bonnet, a UI and a finger in constant light 0.89 to 1.14."""
 
 
-@torch.no_grad()
+@dataclass(frozen=True)
+class SecondEstimate:
+    """Layers from samples in the artifact's mean light."""
+
+    layers: LayerEstimate
+    guide: Tensor
+    """Of the photos in that light (`initialization.guide_of`)."""
+    left: float
+    """Squares that it leaves where the artifact hides, as a share of those that the first estimate leaves; NaN where no
+    sample is hidden."""
+
+
 def refine_in_mean_light(
     overlay: ScreenSpaceOverlay,
     found: LayerEstimate,
@@ -36,36 +47,57 @@ def refine_in_mean_light(
 ) -> LayerEstimate:
     """Estimate the layers once more where the light on them changes, and initialize the overlay from them.
 
-    To an estimate, changes of the light are noise, and some of it passes for scene. The colors of the points tell them
-    apart: what the first estimate leaves of the samples is fitted by a light for each view, and the second is of the
-    samples without it. It holds where it leaves less than half of the first one's squares where the artifact hides:
-    where an artifact moves, a light explains little of that.
+    The second estimate holds where it leaves less than half of the first one's squares: where an artifact moves, a
+    light explains little of them.
 
     Args:
         overlay: initialized from `found`; changed in place where the second estimate holds.
+        found, samples, guide, views, detection: as for `second_estimate`.
+
+    Returns:
+        The estimate that holds.
+    """
+    second = second_estimate(overlay, found, samples, guide, views, detection)
+    if second is None or not second.left < MOST_LEFT:
+        return found
+    initialize_from(overlay, second.layers, second.guide, detection.mask)
+    return second.layers
+
+
+@torch.no_grad()
+def second_estimate(
+    overlay: ScreenSpaceOverlay,
+    found: LayerEstimate,
+    samples: PointSamples,
+    guide: Tensor,
+    views: Sequence[View],
+    detection: Detection,
+) -> SecondEstimate | None:
+    """Estimate the layers once more; None where the light on them does not change.
+
+    To an estimate, changes of the light are noise, and some of it passes for scene. The colors of the points tell them
+    apart: what the first estimate leaves of the samples is fitted by a light for each view, and the second is of the
+    samples without it.
+
+    Args:
+        overlay: initialized from `found`.
         found: the first estimate.
         samples: that it is of.
         guide: of the photos (`initialization.guide_of`).
         views: the photos, that all show the artifact.
         detection: from the same photos.
-
-    Returns:
-        The estimate that holds.
     """
     device = samples.color.device
     basis, (transmittance, addition) = basis_of(overlay).to(device), (layer.to(device) for layer in overlay.layers())
     images, masks = [view.image for view in views], [view.mask for view in views]
     if found.colors is None or not light_changes(images, masks, basis, (transmittance, addition)):
-        return found
+        return None
     small = reduced(basis, working_reduction(overlay.height, overlay.width))
     coefficients = light_of_samples(samples, found, small, len(views))
     relit = in_mean_light(samples, found, small, coefficients)
     guide = guide_in_mean_light(guide.to(device), basis, addition, coefficients)
     second = estimate(relit, guide, detection.opaque, detection.mask, found.falloff)
-    if _squares_left(relit, second, small) < MOST_LEFT * _squares_left(samples, found, small):
-        initialize_from(overlay, second, guide, detection.mask)
-        return second
-    return found
+    return SecondEstimate(second, guide, _squares_left(relit, second, small) / _squares_left(samples, found, small))
 
 
 def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor, views: int) -> Tensor:

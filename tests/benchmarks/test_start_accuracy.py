@@ -55,6 +55,8 @@ def test_in_the_mean_light_a_start_is_nearer_to_the_truth(write_built_in_scene, 
     start, first = (json.loads(line) for line in output.read_text().splitlines())
     assert [start["constant"], first["constant"]] == ["", "first estimate"]
     assert first["light"] > 0.05
+    assert 0 < first["left"] < 0.5
+    assert "left" not in start
     assert start["noise"] < first["noise"]
     assert start["B_on"] < first["B_on"]
 
