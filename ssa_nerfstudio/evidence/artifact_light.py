@@ -106,16 +106,19 @@ def artifact_light(
     return ArtifactLight(found, explained, hidden)
 
 
-def light_changes(
+def changing_light(
     images: Sequence[Tensor], masks: Sequence[Tensor | None], basis: Tensor, layers: tuple[Tensor, Tensor]
-) -> bool:
-    """Whether the light is not the same in all photos, as a regular subset of at most MAX_VIEWS tells.
+) -> ArtifactLight | None:
+    """The light in a regular subset of at most MAX_VIEWS photos, which tell; None where it is the same in them.
 
     Args:
         images, masks, basis, layers: as for `artifact_light`.
     """
+    if _hidden_share(basis) < MIN_SHARE:
+        return None
     some = slice(None, None, -(-len(images) // MAX_VIEWS))
-    return _hidden_share(basis) >= MIN_SHARE and artifact_light(images[some], masks[some], basis, layers).changes
+    found = artifact_light(images[some], masks[some], basis, layers)
+    return found if found.changes else None
 
 
 def affine_terms(of_gains: Tensor, of_slopes: Tensor, slopes: Tensor) -> Tensor:

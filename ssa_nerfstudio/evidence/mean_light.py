@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.artifact_light import HIDING, MAX_COEFFICIENT, affine_terms, light_changes
+from ssa_nerfstudio.evidence.artifact_light import HIDING, MAX_COEFFICIENT, affine_terms, changing_light
 from ssa_nerfstudio.evidence.detection import Detection
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.initialization import estimate, initialize_from
@@ -90,7 +90,7 @@ def second_estimate(
     device = samples.color.device
     basis, (transmittance, addition) = basis_of(overlay).to(device), (layer.to(device) for layer in overlay.layers())
     images, masks = [view.image for view in views], [view.mask for view in views]
-    if found.colors is None or not light_changes(images, masks, basis, (transmittance, addition)):
+    if found.colors is None or changing_light(images, masks, basis, (transmittance, addition)) is None:
         return None
     small = reduced(basis, working_reduction(overlay.height, overlay.width))
     coefficients = light_of_samples(samples, found, small, len(views))

@@ -15,7 +15,7 @@ from torch.nn import Parameter
 
 from ssa_nerfstudio._system.counted_noun import counted
 from ssa_nerfstudio.errors import InputError
-from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, artifact_light, light_changes
+from ssa_nerfstudio.evidence.artifact_light import MAX_COEFFICIENT, artifact_light, changing_light
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.shading import COEFFICIENTS, ShadingSetting, basis_of, light
 from ssa_nerfstudio.plugin.artifacts import Artifacts
@@ -158,8 +158,10 @@ def _light_at_start(
 
     images, masks = [photo["image"] for photo in photos], [photo.get("mask") for photo in photos]
     basis, layers = basis_of(overlay), overlay.layers()
-    if setting == "auto" and not light_changes(images, masks, basis, layers):
-        return None
+    if setting == "auto":
+        some = changing_light(images, masks, basis, layers)
+        if some is None or len(some.coefficients) == count:
+            return None if some is None else some.coefficients
     return artifact_light(images, masks, basis, layers).coefficients
 
 

@@ -123,7 +123,7 @@ def test_in_constant_light_the_first_estimate_holds():
 def test_a_second_estimate_that_explains_little_is_dropped(monkeypatch):
     """As where an artifact moves, which passes for light."""
     start = Start(views(CONSTANT))
-    monkeypatch.setattr(mean_light, "light_changes", lambda *given: True)
+    monkeypatch.setattr(mean_light, "changing_light", lambda *given: "a light")
     assert start.refined() is start.found
     assert error(start.overlay) == start.error
 
