@@ -173,7 +173,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
         initialize_from(overlay, found, guide, detection.mask)
         if refine:
-            found = refine_in_mean_light(overlay, found, samples, guide, views, detection)
+            found = refine_in_mean_light(overlay, found, samples, guide, views, detection).layers
         elif (again := second_estimate(overlay, found, samples, guide, views, detection)) is not None:
             second["left"] = round(again.left, 3)
         return detection, found, overlay

@@ -11,7 +11,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.changing_area import changing_area
+from ssa_nerfstudio.evidence.changing_area import changing_area, moving_parts
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, local_mean, reduced, reduced_deviation, upsample
@@ -108,9 +108,18 @@ def initialize_from(
 
 
 @torch.no_grad()
-def ignore_changing(overlay: ScreenSpaceOverlay, estimate: LayerEstimate) -> None:
-    """Let the scene learn nothing where the artifact changes from photo to photo; the overlay is changed in place."""
-    if (area := changing_area(estimate)).any():
+def ignore_changing(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, moving: PointSamples | None = None) -> None:
+    """Let the scene learn nothing where the artifact changes from photo to photo; the overlay is changed in place.
+
+    Args:
+        overlay: initialized from the estimate.
+        estimate: of its layers.
+        moving: the samples that it is of, where the artifact is known to move (`mean_light.Refined`); else None.
+    """
+    area = changing_area(estimate)
+    if moving is not None:
+        area |= moving_parts(estimate, moving)
+    if area.any():
         reduction = working_reduction(overlay.height, overlay.width)
         kept = torch.from_numpy(~area)[..., None].to(overlay.reliable)
         overlay.reliable = _at_overlay_resolution(enlarged(kept, overlay.height, overlay.width, reduction), overlay)

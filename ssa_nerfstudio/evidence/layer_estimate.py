@@ -70,6 +70,13 @@ class LayerEstimate:
         """The least matte [h, w, 1] that explains T and B."""
         return smallest_matte(self.transmittance, self.addition)
 
+    def left_of(self, samples: PointSamples, those: Tensor) -> Tensor:
+        """What the layers leave of samples [S, 3], given their indices: I - F (T C + B). Colors have to be known."""
+        assert self.colors is not None
+        pixel, observed = samples.pixel[those], samples.color[those]
+        behind = self.transmittance.reshape(-1, 1)[pixel] * self.colors[samples.point[those]]
+        return observed - self.falloff.reshape(-1, 1)[pixel] * (behind + self.addition.reshape(-1, 3)[pixel])
+
     def share(self) -> float:
         """Share of the frame that is hidden or lit by more than CERTAIN_OPACITY."""
         opacity = smallest_matte(self.falloff * self.transmittance, self.falloff * self.addition)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +26,14 @@ MOST_LEFT = 0.5
 makes a difference leave 0.07 to 0.31, occlusions, a bonnet, a UI and a finger in constant light 0.89 to 1.14."""
 
 
+class Refined(NamedTuple):
+    """The estimate that holds."""
+
+    layers: LayerEstimate
+    moves: bool
+    """Whether photos differ where the artifact hides, and not by the light on it: so it moves, or mirrors what does."""
+
+
 @dataclass(frozen=True)
 class SecondEstimate:
     """Layers from samples in the artifact's mean light."""
@@ -44,7 +53,7 @@ def refine_in_mean_light(
     guide: Tensor,
     views: Sequence[View],
     detection: Detection,
-) -> LayerEstimate:
+) -> Refined:
     """Estimate the layers once more where the light on them changes, and initialize the overlay from them.
 
     The second estimate holds where it leaves less than half of the first one's squares: where an artifact moves, a
@@ -53,15 +62,12 @@ def refine_in_mean_light(
     Args:
         overlay: initialized from `found`; changed in place where the second estimate holds.
         found, samples, guide, views, detection: as for `second_estimate`.
-
-    Returns:
-        The estimate that holds.
     """
     second = second_estimate(overlay, found, samples, guide, views, detection)
     if second is None or not second.left < MOST_LEFT:
-        return found
+        return Refined(found, moves=second is not None)
     initialize_from(overlay, second.layers, second.guide, detection.mask)
-    return second.layers
+    return Refined(second.layers, moves=False)
 
 
 @torch.no_grad()
@@ -118,7 +124,7 @@ def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor,
     """
     hides = _hides(samples, basis)
     pixel, view = samples.pixel[hides], samples.view[hides]
-    left, terms = _left(samples, found, hides), _terms(basis, found, pixel)
+    left, terms = found.left_of(samples, hides), _terms(basis, found, pixel)
     coefficients = left.new_zeros(views, COEFFICIENTS)
     variance = torch.full((COEFFICIENTS,), MAX_COEFFICIENT**2, device=left.device, dtype=torch.float64)
     for _ in range(ROUNDS if len(hides) else 0):
@@ -166,20 +172,12 @@ def guide_in_mean_light(guide: Tensor, basis: Tensor, addition: Tensor, coeffici
 
 def _squares_left(samples: PointSamples, found: LayerEstimate, basis: Tensor) -> float:
     """Squared robust deviation of what an estimate leaves of the samples where the artifact hides; NaN without any."""
-    return float(robust_deviation(_left(samples, found, _hides(samples, basis)))) ** 2
+    return float(robust_deviation(found.left_of(samples, _hides(samples, basis)))) ** 2
 
 
 def _hides(samples: PointSamples, basis: Tensor) -> Tensor:
     """Indices of the samples where the artifact hides more than it shows."""
     return (basis.reshape(-1, 3)[samples.pixel, 0] > HIDING).nonzero()[:, 0]
-
-
-def _left(samples: PointSamples, found: LayerEstimate, those: Tensor) -> Tensor:
-    """What an estimate leaves of samples [S, 3], given their indices: I - F (T C + B)."""
-    assert found.colors is not None
-    pixel, observed = samples.pixel[those], samples.color[those]
-    behind = found.transmittance.reshape(-1, 1)[pixel] * found.colors[samples.point[those]]
-    return observed - found.falloff.reshape(-1, 1)[pixel] * (behind + found.addition.reshape(-1, 3)[pixel])
 
 
 def _terms(basis: Tensor, found: LayerEstimate, pixel: Tensor) -> Tensor:

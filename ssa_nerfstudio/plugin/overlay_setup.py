@@ -207,10 +207,11 @@ def _learned_overlay(
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide, detection.mask)
+        moves = False
         if config.shading != "off" and part.gains is None:
-            found = refine_in_mean_light(started, found, samples, guide, views, detection)
+            found, moves = refine_in_mean_light(started, found, samples, guide, views, detection)
         if config.ignore_changing:
-            ignore_changing(started, found)
+            ignore_changing(started, found, samples if moves else None)
         return started
     started = overlay(light)
     if by_points:

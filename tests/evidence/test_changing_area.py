@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from ssa_nerfstudio.evidence.changing_area import changing_area
+from ssa_nerfstudio.evidence.changing_area import changing_area, moving_parts
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
@@ -99,3 +101,59 @@ def test_samples_of_what_sways_are_unexplained_and_those_of_what_stands_still_ar
     assert unexplained[26:34, 18:24].mean() > 0.3
     assert unexplained[6:12, 42:50].mean() < 0.05
     assert unexplained[5:20, 5:35].mean() < 0.05
+
+
+LEFT = {"moves": 0.07, "stands": 0.02, "moves, but is a spot": 0.07, "clear": 0.06}
+"""Deviation of the samples from the layers, by what they show; noise is 0.05."""
+PARTS = {"moves": (20, 20, 10, 12), "stands": (20, 44, 10, 12), "moves, but is a spot": (4, 4, 5, 8)}
+"""Row, column, height and width. The spot is 1.7 % of the frame."""
+
+
+def part(name: str, wider: int = 0) -> tuple[slice, slice]:
+    row, column, height, width = PARTS[name]
+    return slice(row - wider, row + height + wider), slice(column - wider, column + width + wider)
+
+
+def in_parts(opacity: float = 0.8) -> tuple[LayerEstimate, PointSamples]:
+    """Layers of three parts in a frame, and samples that deviate from them by LEFT."""
+    generator = torch.Generator().manual_seed(5)
+    hidden, deviation = torch.zeros(HEIGHT, WIDTH, 1), torch.full((HEIGHT, WIDTH, 1), LEFT["clear"])
+    for name in PARTS:
+        hidden[part(name)], deviation[part(name)] = opacity, LEFT[name]
+    falloff = torch.linspace(1, 0.7, WIDTH).expand(HEIGHT, WIDTH)[..., None].contiguous()
+    colors = torch.rand(500, 3, generator=generator)
+    ones, addition = torch.ones_like(hidden), hidden * PAINT
+    found = LayerEstimate(1 - hidden, addition, falloff, 0 * ones, torch.tensor(0.05), colors)
+    pixel = torch.arange(HEIGHT * WIDTH).repeat(6)
+    point = torch.randint(500, pixel.shape, generator=generator)
+    shown = (falloff * (1 - hidden)).reshape(-1, 1)[pixel] * colors[point]
+    shown = shown + (falloff * addition).reshape(-1, 3)[pixel]
+    shown = shown + deviation.reshape(-1, 1)[pixel] * torch.randn(shown.shape, generator=generator)
+    return found, PointSamples(point, pixel, shown, 500, (HEIGHT, WIDTH), torch.zeros_like(pixel))
+
+
+def test_a_part_moves_if_its_samples_deviate_more_than_a_scene_behind_it_could_and_its_rim_belongs_to_it() -> None:
+    expected = np.zeros((HEIGHT, WIDTH), bool)
+    expected[part("moves", wider=2)] = True
+    assert (moving_parts(*in_parts()) == expected).all()
+
+
+def test_what_lets_half_of_the_scene_through_does_not_move() -> None:
+    assert not moving_parts(*in_parts(0.45)).any()
+    assert moving_parts(*in_parts(0.55)).any()
+
+
+def test_a_part_without_samples_does_not_move() -> None:
+    found, samples = in_parts()
+    inside = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    inside[part("moves")] = True
+    kept = ~inside.flatten()[samples.pixel]
+    fewer = {name: getattr(samples, name)[kept] for name in ("point", "pixel", "color", "view")}
+    assert not moving_parts(found, replace(samples, **fewer)).any()
+
+
+@pytest.mark.parametrize(("noise", "moves"), [(0.11, False), (0.09, True)])
+def test_a_scene_of_more_noise_explains_more(noise: float, moves: bool) -> None:
+    """The squares of 0.07 are half of those of 0.1."""
+    found, samples = in_parts()
+    assert moving_parts(replace(found, noise=torch.tensor(noise)), samples).any() == moves

@@ -8,10 +8,12 @@ import torch
 
 from ssa_nerfstudio.evidence import mean_light
 from ssa_nerfstudio.evidence.artifact_light import artifact_light
+from ssa_nerfstudio.evidence.changing_area import moving_parts
 from ssa_nerfstudio.evidence.detection import detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.mean_light import (
+    Refined,
     guide_in_mean_light,
     in_mean_light,
     light_of_samples,
@@ -83,7 +85,7 @@ class Start:
         initialize_from(self.overlay, self.found, self.guide, self.detection.mask)
         self.error = error(self.overlay)
 
-    def refined(self, found: LayerEstimate | None = None) -> LayerEstimate:
+    def refined(self, found: LayerEstimate | None = None) -> Refined:
         found = found or self.found
         return refine_in_mean_light(self.overlay, found, self.samples, self.guide, self.photos, self.detection)
 
@@ -95,8 +97,9 @@ def error(overlay: ScreenSpaceOverlay) -> float:
 
 def test_where_the_light_changes_a_second_estimate_is_nearer_to_the_truth():
     start = Start(views(changing()))
-    second = start.refined()
+    second, moves = start.refined()
     assert second is not start.found
+    assert not moves
     assert second.noise < start.found.noise
     assert error(start.overlay) < min(0.01, 0.7 * start.error)
     assert start.overlay.noise == second.noise
@@ -116,7 +119,10 @@ def test_the_second_estimate_is_told_how_much_photos_vary_without_the_light(monk
 def test_in_constant_light_the_first_estimate_holds():
     start = Start(views(CONSTANT))
     before = {name: value.clone() for name, value in start.overlay.state_dict().items()}
-    assert start.refined() is start.found
+    layers, moves = start.refined()
+    assert layers is start.found
+    # What is smooth in the scene passes for light here.
+    assert not moves or not moving_parts(layers, start.samples).any()
     assert all(torch.equal(value, before[name]) for name, value in start.overlay.state_dict().items())
 
 
@@ -124,7 +130,7 @@ def test_a_second_estimate_that_explains_little_is_dropped(monkeypatch):
     """As where an artifact moves, which passes for light."""
     start = Start(views(CONSTANT))
     monkeypatch.setattr(mean_light, "changing_light", lambda *given: "a light")
-    assert start.refined() is start.found
+    assert start.refined() == (start.found, True)
     assert error(start.overlay) == start.error
 
 

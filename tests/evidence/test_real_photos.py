@@ -57,3 +57,22 @@ def test_a_short_clip_of_a_walk_straight_ahead_is_clean_and_a_watermark_in_it_is
     clips = [*stretches(len(walk.views), 8), *stretches(len(walk.views), 24)]
     assert {found.verdict for found in detections(walk, None, 0, clips)} == {"none"}
     assert "none" not in {found.verdict for found in detections(walk, "watermark", 0, clips)}
+
+
+@pytest.mark.parametrize(("effect", "moves"), [("occlusion", True), ("ui", False)])
+def test_the_scene_learns_nothing_behind_what_sways_and_all_the_rest(
+    captures, tmp_path, configure_training, train_and_evaluate, effect, moves
+):
+    """An occlusion moves by two pixels and its light changes by 15 %; buttons do neither."""
+    data = tmp_path / effect
+    main(["simulate", "--data", str(captures / "fox"), "--output", str(data), "--effects", effect])
+    _, pipeline, _ = train_and_evaluate(configure_training("ssa-splatfacto", data, tmp_path, 1, {}, scale_factor=0.5))
+    learned = pipeline.model.artifacts.learned()[0].reliable[..., 0] > 0
+    if not moves:
+        assert learned.all()
+        return
+    with np.load(data / "layers" / "undistorted.npz") as layers:
+        truth = layers["T"].mean(axis=-1)
+    hidden = torch.from_numpy(truth[::2, ::2] < 0.5)[: len(learned), : learned.shape[1]]
+    assert learned[hidden].float().mean() < 0.05
+    assert learned[~hidden].float().mean() > 0.95

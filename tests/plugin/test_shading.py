@@ -404,18 +404,25 @@ def test_a_light_that_is_the_same_in_all_photos_is_not_learned(train_resumable, 
     assert "shading" not in trainer.optimizers.optimizers
 
 
+@pytest.mark.parametrize("moves", [False, True])
 @pytest.mark.parametrize(
     ("model", "times"), [({}, 1), ({"shading": "affine"}, 1), ({"shading": "off"}, 0), ({"exposure": "affine"}, 0)]
 )
-def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypatch, model, times):
+def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypatch, model, times, moves):
     seen, unlike = [], []
-    monkeypatch.setattr(overlay_setup, "ignore_changing", lambda overlay, found: unlike.append(found))
-    monkeypatch.setattr(
-        overlay_setup, "refine_in_mean_light", lambda overlay, found, *others: seen.append(found) or "second"
-    )
+
+    def refine(overlay, found, samples, *others):
+        seen.append(samples)
+        return "second", moves
+
+    monkeypatch.setattr(overlay_setup, "refine_in_mean_light", refine)
+    monkeypatch.setattr(overlay_setup, "ignore_changing", lambda *given: unlike.append(given[1:]))
     train(steps=1, **model)
     assert len(seen) == times
-    assert unlike == ["second"] * times or not times
+    (found, moving), *more = unlike
+    assert not more
+    assert moving is (seen[0] if moves and times else None)
+    assert found == "second" or not times
 
 
 def test_photos_of_varying_exposure_do_not_tell(train):
