@@ -18,10 +18,14 @@ USUAL = 0.99
 MIN_MEAN_OPACITY = 0.5
 """An unusual area is an artifact's if it hides half of the scene: shading and reflections on an object that stays in
 the middle of the frame hide a quarter, a weapon three quarters."""
-MOST_LEFT = 0.5
+MOST_LEFT_BEHIND = 0.5
 """Squares that the layers leave of the samples in a part, as a share of those that they leave of all samples. Behind
-what hides more than half, the scene's own noise is at most a quarter; this is halfway to all (geometric mean). Parts
-that stand still have 0.02 to 0.29, an occlusion 0.72 to 1.28, a weapon that sways 10.8."""
+what hides more than half, the scene leaves at most a quarter; a half is the geometric mean of that and 1. Parts that
+stand still have 0.02 to 0.29, an occlusion 0.72 to 1.28, a weapon that sways 10.7."""
+MIN_SAMPLES = 50
+"""Of a part: of fewer, more than a hundredth of the parts that stand still (at a quarter) would seem to move."""
+_ROUNDING = ((1.48 / 2 + 1) * GRAY_LEVEL) ** 2
+"""Square of `robust_deviation` where photos are rounded by half a gray level and nothing else is left."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 
@@ -44,18 +48,16 @@ def changing_area(estimate: LayerEstimate) -> np.ndarray:
 
 
 def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
-    """Where an artifact moves that is known to: bool [h, w], of the working size, two pixels wider than what is found.
+    """Where parts of an artifact move: bool [h, w], of the working size, two pixels wider than what is found.
 
     A connected part of what hides more than half of the scene moves if the layers leave more of its samples than a
     scene behind it could. It covers MIN_SHARE of the frame: of less, errors of the layers may be the reason.
 
     Args:
         estimate: of the layers, with the points' colors.
-        samples: that it is of.
+        samples: that it is of, as photos show them (behind a falloff).
     """
-    usual = MOST_LEFT * estimate.noise.square().cpu()
-    # Photos are rounded by up to half a gray level, which is all that is left of a scene without noise.
-    usual += robust_deviation(torch.full((1,), GRAY_LEVEL / 2)).square()
+    limit = MOST_LEFT_BEHIND * float(estimate.noise) ** 2
     hides = (estimate.opacity()[..., 0] > MIN_MEAN_OPACITY).cpu().numpy().astype(np.uint8)
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(hides, connectivity=8)
     kept = np.zeros_like(hides)
@@ -64,7 +66,11 @@ def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
             continue
         inside = torch.from_numpy(labels.ravel() == part).to(samples.pixel.device)
         those = inside[samples.pixel].nonzero()[:, 0]
-        if len(those) and robust_deviation(estimate.left_of(samples, those)).square().cpu() > usual:
+        if len(those) < MIN_SAMPLES:
+            continue
+        # Without the falloff, as the noise is.
+        left = estimate.left_of(samples, those) / estimate.falloff.reshape(-1, 1)[samples.pixel[those]]
+        if float(robust_deviation(left)) ** 2 > limit + _ROUNDING:
             kept[labels == part] = 1
     return _widened(kept)
 

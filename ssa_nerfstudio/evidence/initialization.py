@@ -114,7 +114,7 @@ def ignore_changing(overlay: ScreenSpaceOverlay, estimate: LayerEstimate, moving
     Args:
         overlay: initialized from the estimate.
         estimate: of its layers.
-        moving: the samples that it is of, where the artifact is known to move (`mean_light.Refined`); else None.
+        moving: the samples that it is of, where the artifact may move as a whole (`mean_light.Refined`); else None.
     """
     area = changing_area(estimate)
     if moving is not None:

@@ -27,11 +27,12 @@ makes a difference leave 0.07 to 0.31, occlusions, a bonnet, a UI and a finger i
 
 
 class Refined(NamedTuple):
-    """The estimate that holds."""
+    """The estimate that holds, and what a second one has told."""
 
     layers: LayerEstimate
-    moves: bool
-    """Whether photos differ where the artifact hides, and not by the light on it: so it moves, or mirrors what does."""
+    may_move: bool
+    """Whether photos differ where the artifact hides by more than a light explains; `changing_area.moving_parts` tells
+    where."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,9 @@ def refine_in_mean_light(
     """
     second = second_estimate(overlay, found, samples, guide, views, detection)
     if second is None or not second.left < MOST_LEFT:
-        return Refined(found, moves=second is not None)
+        return Refined(found, may_move=second is not None and second.left >= MOST_LEFT)
     initialize_from(overlay, second.layers, second.guide, detection.mask)
-    return Refined(second.layers, moves=False)
+    return Refined(second.layers, may_move=False)
 
 
 @torch.no_grad()

@@ -207,11 +207,11 @@ def _learned_overlay(
     if by_points and found is not None:
         started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
         initialize_from(started, found, guide, detection.mask)
-        moves = False
+        may_move = False
         if config.shading != "off" and part.gains is None:
-            found, moves = refine_in_mean_light(started, found, samples, guide, views, detection)
+            found, may_move = refine_in_mean_light(started, found, samples, guide, views, detection)
         if config.ignore_changing:
-            ignore_changing(started, found, samples if moves else None)
+            ignore_changing(started, found, samples if may_move else None)
         return started
     started = overlay(light)
     if by_points:

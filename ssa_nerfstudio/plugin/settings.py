@@ -61,7 +61,8 @@ class ModelSettings(SplatfactoModelConfig):
     splat covers (a sky without points) is not rewarded; False: plain compositing, as in the paper."""
     ignore_changing: bool = True
     """Where the estimate from points finds an artifact that changes from photo to photo, such as a weapon that sways,
-    the photos teach the scene nothing; False: they do."""
+    or an occlusion where `shading` is not off and no exposure is learned, the photos teach the scene nothing; False:
+    they do."""
     distant_seeds: bool = True
     """Where an overlay is trained with overlay_start "points", or given: start also from Gaussians far away in
     directions in which structure from motion has found no points, such as a sky, and the photos agree on a color.

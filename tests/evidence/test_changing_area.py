@@ -9,8 +9,10 @@ import pytest
 import torch
 
 from ssa_nerfstudio.evidence.changing_area import changing_area, moving_parts
+from ssa_nerfstudio.evidence.initialization import ignore_changing
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
 HEIGHT, WIDTH = 40, 60
 BLOB = slice(24, 36), slice(20, 34)
@@ -103,57 +105,108 @@ def test_samples_of_what_sways_are_unexplained_and_those_of_what_stands_still_ar
     assert unexplained[5:20, 5:35].mean() < 0.05
 
 
-LEFT = {"moves": 0.07, "stands": 0.02, "moves, but is a spot": 0.07, "clear": 0.06}
-"""Deviation of the samples from the layers, by what they show; noise is 0.05."""
-PARTS = {"moves": (20, 20, 10, 12), "stands": (20, 44, 10, 12), "moves, but is a spot": (4, 4, 5, 8)}
-"""Row, column, height and width. The spot is 1.7 % of the frame."""
+Part = tuple[int, int, int, int]
+"""Rows from and to, columns from and to."""
+NOISE = 0.05
+"""Of all samples."""
+STILL, MOVES = 0.02, 0.07
+"""Deviation from the layers behind what stands still and of what moves."""
 
 
-def part(name: str, wider: int = 0) -> tuple[slice, slice]:
-    row, column, height, width = PARTS[name]
-    return slice(row - wider, row + height + wider), slice(column - wider, column + width + wider)
-
-
-def in_parts(opacity: float = 0.8) -> tuple[LayerEstimate, PointSamples]:
-    """Layers of three parts in a frame, and samples that deviate from them by LEFT."""
+def in_parts(
+    parts: dict[Part, float], opacity: float = 0.8, samples_of_pixel: int = 6
+) -> tuple[LayerEstimate, PointSamples]:
+    """Layers of parts in a frame behind a falloff, and samples that deviate from them, without it, by these numbers."""
     generator = torch.Generator().manual_seed(5)
-    hidden, deviation = torch.zeros(HEIGHT, WIDTH, 1), torch.full((HEIGHT, WIDTH, 1), LEFT["clear"])
-    for name in PARTS:
-        hidden[part(name)], deviation[part(name)] = opacity, LEFT[name]
-    falloff = torch.linspace(1, 0.7, WIDTH).expand(HEIGHT, WIDTH)[..., None].contiguous()
+    hidden, deviation = torch.zeros(HEIGHT, WIDTH, 1), torch.full((HEIGHT, WIDTH, 1), NOISE)
+    for (top, bottom, left, right), own in parts.items():
+        hidden[top:bottom, left:right], deviation[top:bottom, left:right] = opacity, own
+    falloff = torch.linspace(1, 0.6, WIDTH).expand(HEIGHT, WIDTH)[..., None].contiguous()
     colors = torch.rand(500, 3, generator=generator)
     ones, addition = torch.ones_like(hidden), hidden * PAINT
-    found = LayerEstimate(1 - hidden, addition, falloff, 0 * ones, torch.tensor(0.05), colors)
-    pixel = torch.arange(HEIGHT * WIDTH).repeat(6)
+    found = LayerEstimate(1 - hidden, addition, falloff, 0 * ones, torch.tensor(NOISE), colors)
+    pixel = torch.arange(HEIGHT * WIDTH).repeat(samples_of_pixel)
     point = torch.randint(500, pixel.shape, generator=generator)
-    shown = (falloff * (1 - hidden)).reshape(-1, 1)[pixel] * colors[point]
-    shown = shown + (falloff * addition).reshape(-1, 3)[pixel]
+    shown = (1 - hidden).reshape(-1, 1)[pixel] * colors[point] + addition.reshape(-1, 3)[pixel]
     shown = shown + deviation.reshape(-1, 1)[pixel] * torch.randn(shown.shape, generator=generator)
+    shown = falloff.reshape(-1, 1)[pixel] * shown
     return found, PointSamples(point, pixel, shown, 500, (HEIGHT, WIDTH), torch.zeros_like(pixel))
 
 
-def test_a_part_moves_if_its_samples_deviate_more_than_a_scene_behind_it_could_and_its_rim_belongs_to_it() -> None:
-    expected = np.zeros((HEIGHT, WIDTH), bool)
-    expected[part("moves", wider=2)] = True
-    assert (moving_parts(*in_parts()) == expected).all()
+def area(*parts: Part, wider: int = 2) -> np.ndarray:
+    found = np.zeros((HEIGHT, WIDTH), bool)
+    for top, bottom, left, right in parts:
+        found[top - wider : bottom + wider, left - wider : right + wider] = True
+    return found
 
 
-def test_what_lets_half_of_the_scene_through_does_not_move() -> None:
-    assert not moving_parts(*in_parts(0.45)).any()
-    assert moving_parts(*in_parts(0.55)).any()
+LEFT_PART, RIGHT_PART = (4, 14, 6, 18), (24, 34, 44, 56)
+SPOT, LARGER_SPOT = (20, 25, 8, 17), (20, 26, 8, 18)
+"""1.9 and 2.5 % of the frame."""
 
 
-def test_a_part_without_samples_does_not_move() -> None:
-    found, samples = in_parts()
-    inside = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
-    inside[part("moves")] = True
-    kept = ~inside.flatten()[samples.pixel]
+@pytest.mark.parametrize(
+    ("parts", "moving"),
+    [
+        ({LEFT_PART: MOVES, RIGHT_PART: STILL}, [LEFT_PART]),
+        ({LEFT_PART: STILL, RIGHT_PART: MOVES}, [RIGHT_PART]),
+        ({LEFT_PART: MOVES, RIGHT_PART: MOVES}, [LEFT_PART, RIGHT_PART]),
+        ({SPOT: MOVES}, []),
+        ({LARGER_SPOT: MOVES}, [LARGER_SPOT]),
+    ],
+    ids=["left", "right", "both", "of a spot errors may be the reason", "no spot"],
+)
+def test_a_part_moves_if_its_samples_deviate_more_than_a_scene_behind_it_could_and_its_rim_belongs_to_it(
+    parts: dict[Part, float], moving: list[Part]
+) -> None:
+    assert (moving_parts(*in_parts(parts)) == area(*moving)).all()
+
+
+def test_parts_that_touch_by_a_corner_are_one() -> None:
+    halves = {(20, 25, 8, 16): MOVES, (25, 30, 16, 24): MOVES}
+    assert moving_parts(*in_parts(halves))[20:25, 8:16].all()
+
+
+def test_what_lets_half_of_the_scene_through_does_not_move_unless_it_is_bright() -> None:
+    assert not moving_parts(*in_parts({LEFT_PART: MOVES}, 0.45)).any()
+    assert moving_parts(*in_parts({LEFT_PART: MOVES}, 0.55)).any()
+    found, samples = in_parts({LEFT_PART: MOVES}, 0.45)
+    inside = torch.from_numpy(area(LEFT_PART, wider=0))
+    found.addition[inside] += 0.2
+    samples.color.add_((0.2 * inside[..., None] * found.falloff).reshape(-1, 1)[samples.pixel])
+    assert moving_parts(found, samples).any()
+
+
+@pytest.mark.parametrize(("number", "moves"), [(0, False), (49, False), (50, True)])
+def test_few_samples_say_nothing(number: int, moves: bool) -> None:
+    found, samples = in_parts({LEFT_PART: 2 * MOVES})
+    inside = torch.from_numpy(area(LEFT_PART, wider=0)).flatten()[samples.pixel]
+    kept = ~inside
+    kept[inside.nonzero()[:number, 0]] = True
     fewer = {name: getattr(samples, name)[kept] for name in ("point", "pixel", "color", "view")}
-    assert not moving_parts(found, replace(samples, **fewer)).any()
+    assert moving_parts(found, replace(samples, **fewer)).any() == moves
 
 
 @pytest.mark.parametrize(("noise", "moves"), [(0.11, False), (0.09, True)])
 def test_a_scene_of_more_noise_explains_more(noise: float, moves: bool) -> None:
     """The squares of 0.07 are half of those of 0.1."""
-    found, samples = in_parts()
+    found, samples = in_parts({RIGHT_PART: MOVES})
     assert moving_parts(replace(found, noise=torch.tensor(noise)), samples).any() == moves
+
+
+def test_rounding_is_no_movement() -> None:
+    found, samples = in_parts({LEFT_PART: 0.0})
+    samples.color.add_(0.5 / 255)
+    assert not moving_parts(replace(found, noise=torch.tensor(1 / 255)), samples).any()
+
+
+def test_the_scene_learns_neither_where_samples_are_unusual_nor_where_a_part_moves() -> None:
+    found, samples = in_parts({LEFT_PART: STILL, RIGHT_PART: MOVES})
+    found.unexplained[torch.from_numpy(area(LEFT_PART, wider=0))] = 0.4
+    for moving, parts in ((None, [LEFT_PART]), (samples, [LEFT_PART, RIGHT_PART])):
+        overlay = ScreenSpaceOverlay(HEIGHT, WIDTH)
+        ignore_changing(overlay, found, moving)
+        assert (overlay.reliable[..., 0].numpy() == ~area(*parts)).all()
+    overlay = ScreenSpaceOverlay(HEIGHT, WIDTH)
+    ignore_changing(overlay, *in_parts({LEFT_PART: STILL}))
+    assert overlay.reliable.shape == (1, 1, 1)

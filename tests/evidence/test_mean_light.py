@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
+import pytest
 import torch
 
 from ssa_nerfstudio.evidence import mean_light
@@ -14,6 +16,7 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initializ
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.mean_light import (
     Refined,
+    SecondEstimate,
     guide_in_mean_light,
     in_mean_light,
     light_of_samples,
@@ -97,9 +100,9 @@ def error(overlay: ScreenSpaceOverlay) -> float:
 
 def test_where_the_light_changes_a_second_estimate_is_nearer_to_the_truth():
     start = Start(views(changing()))
-    second, moves = start.refined()
+    second, may_move = start.refined()
     assert second is not start.found
-    assert not moves
+    assert not may_move
     assert second.noise < start.found.noise
     assert error(start.overlay) < min(0.01, 0.7 * start.error)
     assert start.overlay.noise == second.noise
@@ -119,10 +122,10 @@ def test_the_second_estimate_is_told_how_much_photos_vary_without_the_light(monk
 def test_in_constant_light_the_first_estimate_holds():
     start = Start(views(CONSTANT))
     before = {name: value.clone() for name, value in start.overlay.state_dict().items()}
-    layers, moves = start.refined()
+    layers, may_move = start.refined()
     assert layers is start.found
     # What is smooth in the scene passes for light here.
-    assert not moves or not moving_parts(layers, start.samples).any()
+    assert not may_move or not moving_parts(layers, start.samples).any()
     assert all(torch.equal(value, before[name]) for name, value in start.overlay.state_dict().items())
 
 
@@ -132,6 +135,19 @@ def test_a_second_estimate_that_explains_little_is_dropped(monkeypatch):
     monkeypatch.setattr(mean_light, "changing_light", lambda *given: "a light")
     assert start.refined() == (start.found, True)
     assert error(start.overlay) == start.error
+
+
+@pytest.mark.parametrize(
+    ("left", "holds", "may_move"),
+    [(0.49, True, False), (0.51, False, True), (1.1, False, True), (math.nan, False, False), (None, False, False)],
+)
+def test_how_much_is_left_decides_which_estimate_holds_and_whether_parts_may_move(monkeypatch, left, holds, may_move):
+    start = Start(views(CONSTANT))
+    again = replace(start.found, noise=start.found.noise / 2)
+    second = None if left is None else SecondEstimate(again, start.guide, left)
+    monkeypatch.setattr(mean_light, "second_estimate", lambda *given: second)
+    assert start.refined() == (again if holds else start.found, may_move)
+    assert start.overlay.noise == (again if holds else start.found).noise
 
 
 def rms(difference: torch.Tensor) -> float:

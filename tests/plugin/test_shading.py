@@ -404,16 +404,16 @@ def test_a_light_that_is_the_same_in_all_photos_is_not_learned(train_resumable, 
     assert "shading" not in trainer.optimizers.optimizers
 
 
-@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("may_move", [False, True])
 @pytest.mark.parametrize(
     ("model", "times"), [({}, 1), ({"shading": "affine"}, 1), ({"shading": "off"}, 0), ({"exposure": "affine"}, 0)]
 )
-def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypatch, model, times, moves):
+def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypatch, model, times, may_move):
     seen, unlike = [], []
 
     def refine(overlay, found, samples, *others):
         seen.append(samples)
-        return "second", moves
+        return "second", may_move
 
     monkeypatch.setattr(overlay_setup, "refine_in_mean_light", refine)
     monkeypatch.setattr(overlay_setup, "ignore_changing", lambda *given: unlike.append(given[1:]))
@@ -421,7 +421,7 @@ def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypa
     assert len(seen) == times
     (found, moving), *more = unlike
     assert not more
-    assert moving is (seen[0] if moves and times else None)
+    assert moving is (seen[0] if may_move and times else None)
     assert found == "second" or not times
 
 
