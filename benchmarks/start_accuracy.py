@@ -172,9 +172,10 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         found = estimate(samples, guide, detection.opaque, detection.mask)
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
         initialize_from(overlay, found, guide, detection.mask)
+        again = second_estimate(overlay, found, samples, guide, views, detection)
         if refine:
-            found = refine_in_mean_light(overlay, found, samples, guide, views, detection).layers
-        elif (again := second_estimate(overlay, found, samples, guide, views, detection)) is not None:
+            found = refine_in_mean_light(overlay, found, again, detection.mask).layers
+        elif again is not None:
             second["left"] = round(again.left, 3)
         return detection, found, overlay
 

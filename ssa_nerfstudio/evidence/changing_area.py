@@ -24,8 +24,8 @@ what hides more than half, the scene leaves at most a quarter; a half is the geo
 stand still have 0.02 to 0.29, an occlusion 0.72 to 1.28, a weapon that sways 10.7."""
 MIN_SAMPLES = 50
 """Of a part: of fewer, more than a hundredth of the parts that stand still (at a quarter) would seem to move."""
-_ROUNDING = ((1.48 / 2 + 1) * GRAY_LEVEL) ** 2
-"""Square of `robust_deviation` where photos are rounded by half a gray level and nothing else is left."""
+_ROUNDING = float(robust_deviation(torch.tensor(GRAY_LEVEL / 2))) ** 2
+"""Square of the robust deviation where photos are rounded by half a gray level and nothing else is left."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 
 

@@ -43,8 +43,8 @@ CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
 """Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.2 % of the frame of three
 clean captures."""
 MIN_SHARE = 0.02
-"""Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What
-is found on less may be an error of the layers."""
+"""Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What is found
+on less may be an error of the layers."""
 
 _LEAST_WEIGHT = 1e-3
 """Of a sample that is left out of a median: a point that has no others keeps a color."""

@@ -48,26 +48,22 @@ class SecondEstimate:
 
 
 def refine_in_mean_light(
-    overlay: ScreenSpaceOverlay,
-    found: LayerEstimate,
-    samples: PointSamples,
-    guide: Tensor,
-    views: Sequence[View],
-    detection: Detection,
+    overlay: ScreenSpaceOverlay, found: LayerEstimate, second: SecondEstimate | None, static: Tensor
 ) -> Refined:
-    """Estimate the layers once more where the light on them changes, and initialize the overlay from them.
+    """Initialize the overlay from a second estimate, if that holds.
 
-    The second estimate holds where it leaves less than half of the first one's squares: where an artifact moves, a
-    light explains little of them.
+    It holds where it leaves less than half of the first one's squares: where an artifact moves, a light explains little
+    of them.
 
     Args:
         overlay: initialized from `found`; changed in place where the second estimate holds.
-        found, samples, guide, views, detection: as for `second_estimate`.
+        found: the first estimate.
+        second: the second (`second_estimate`).
+        static: [H, W] bool: where static edges are (`Detection.mask`).
     """
-    second = second_estimate(overlay, found, samples, guide, views, detection)
     if second is None or not second.left < MOST_LEFT:
         return Refined(found, may_move=second is not None and second.left >= MOST_LEFT)
-    initialize_from(overlay, second.layers, second.guide, detection.mask)
+    initialize_from(overlay, second.layers, second.guide, static)
     return Refined(second.layers, may_move=False)
 
 

@@ -23,7 +23,7 @@ from ssa_nerfstudio.evidence.change_points import change_points
 from ssa_nerfstudio.evidence.detection import MIN_VIEWS, Detection, detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, ignore_changing, initialize, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
-from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light
+from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light, second_estimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
@@ -209,7 +209,8 @@ def _learned_overlay(
         initialize_from(started, found, guide, detection.mask)
         may_move = False
         if config.shading != "off" and part.gains is None:
-            found, may_move = refine_in_mean_light(started, found, samples, guide, views, detection)
+            second = second_estimate(started, found, samples, guide, views, detection)
+            found, may_move = refine_in_mean_light(started, found, second, detection.mask)
         if config.ignore_changing:
             ignore_changing(started, found, samples if may_move else None)
         return started

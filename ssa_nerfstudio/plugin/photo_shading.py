@@ -160,8 +160,10 @@ def _light_at_start(
     basis, layers = basis_of(overlay), overlay.layers()
     if setting == "auto":
         some = changing_light(images, masks, basis, layers)
-        if some is None or len(some.coefficients) == count:
-            return None if some is None else some.coefficients
+        if some is None:
+            return None
+        if len(some.coefficients) == count:
+            return some.coefficients
     return artifact_light(images, masks, basis, layers).coefficients
 
 

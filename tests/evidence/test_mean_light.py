@@ -21,6 +21,7 @@ from ssa_nerfstudio.evidence.mean_light import (
     in_mean_light,
     light_of_samples,
     refine_in_mean_light,
+    second_estimate,
 )
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
 from ssa_nerfstudio.evidence.statistics import UNKNOWN_DEVIATION, accumulate
@@ -88,9 +89,9 @@ class Start:
         initialize_from(self.overlay, self.found, self.guide, self.detection.mask)
         self.error = error(self.overlay)
 
-    def refined(self, found: LayerEstimate | None = None) -> Refined:
-        found = found or self.found
-        return refine_in_mean_light(self.overlay, found, self.samples, self.guide, self.photos, self.detection)
+    def refined(self) -> Refined:
+        second = second_estimate(self.overlay, self.found, self.samples, self.guide, self.photos, self.detection)
+        return refine_in_mean_light(self.overlay, self.found, second, self.detection.mask)
 
 
 def error(overlay: ScreenSpaceOverlay) -> float:
@@ -141,12 +142,12 @@ def test_a_second_estimate_that_explains_little_is_dropped(monkeypatch):
     ("left", "holds", "may_move"),
     [(0.49, True, False), (0.51, False, True), (1.1, False, True), (math.nan, False, False), (None, False, False)],
 )
-def test_how_much_is_left_decides_which_estimate_holds_and_whether_parts_may_move(monkeypatch, left, holds, may_move):
+def test_how_much_is_left_decides_which_estimate_holds_and_whether_parts_may_move(left, holds, may_move):
     start = Start(views(CONSTANT))
     again = replace(start.found, noise=start.found.noise / 2)
     second = None if left is None else SecondEstimate(again, start.guide, left)
-    monkeypatch.setattr(mean_light, "second_estimate", lambda *given: second)
-    assert start.refined() == (again if holds else start.found, may_move)
+    refined = refine_in_mean_light(start.overlay, start.found, second, start.detection.mask)
+    assert refined == (again if holds else start.found, may_move)
     assert start.overlay.noise == (again if holds else start.found).noise
 
 

@@ -411,10 +411,15 @@ def test_a_light_that_is_the_same_in_all_photos_is_not_learned(train_resumable, 
 def test_the_start_is_estimated_again_where_there_may_be_shading(train, monkeypatch, model, times, may_move):
     seen, unlike = [], []
 
-    def refine(overlay, found, samples, *others):
+    def estimate_again(overlay, found, samples, *others):
         seen.append(samples)
+        return "again"
+
+    def refine(overlay, found, second, static):
+        assert second == "again"
         return "second", may_move
 
+    monkeypatch.setattr(overlay_setup, "second_estimate", estimate_again)
     monkeypatch.setattr(overlay_setup, "refine_in_mean_light", refine)
     monkeypatch.setattr(overlay_setup, "ignore_changing", lambda *given: unlike.append(given[1:]))
     train(steps=1, **model)
