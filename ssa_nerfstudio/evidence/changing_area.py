@@ -50,20 +50,17 @@ def changing_area(estimate: LayerEstimate) -> np.ndarray:
 def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
     """Where parts of an artifact move: bool [h, w], of the working size, two pixels wider than what is found.
 
-    A connected part of what hides more than half of the scene moves if the layers leave more of its samples than a
-    scene behind it could. It covers MIN_SHARE of the frame: of less, errors of the layers may be the reason.
+    A large part of what hides more than half of the scene moves if the layers leave more of its samples than a scene
+    behind it could: of a small one, errors of the layers may be the reason.
 
     Args:
         estimate: of the layers, with the points' colors.
         samples: that it is of, as photos show them (behind a falloff).
     """
     limit = MOST_LEFT_BEHIND * float(estimate.noise) ** 2
-    hides = (estimate.opacity()[..., 0] > MIN_MEAN_OPACITY).cpu().numpy().astype(np.uint8)
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(hides, connectivity=8)
-    kept = np.zeros_like(hides)
-    for part in range(1, count):
-        if statistics[part, cv2.CC_STAT_AREA] < MIN_SHARE * hides.size:
-            continue
+    labels = cv2.connectedComponents(large_parts(estimate).astype(np.uint8), connectivity=8)[1]
+    kept = np.zeros_like(labels, dtype=np.uint8)
+    for part in range(1, labels.max() + 1):
         inside = torch.from_numpy(labels.ravel() == part).to(samples.pixel.device)
         those = inside[samples.pixel].nonzero()[:, 0]
         if len(those) < MIN_SAMPLES:
@@ -73,6 +70,13 @@ def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
         if float(robust_deviation(left)) ** 2 > limit + _ROUNDING:
             kept[labels == part] = 1
     return _widened(kept)
+
+
+def large_parts(estimate: LayerEstimate) -> np.ndarray:
+    """Connected parts that hide more than half of the scene and cover MIN_SHARE of the frame: bool [h, w]."""
+    hides = (estimate.opacity()[..., 0] > MIN_MEAN_OPACITY).cpu().numpy().astype(np.uint8)
+    _, labels, statistics, _ = cv2.connectedComponentsWithStats(hides, connectivity=8)
+    return (hides > 0) & (statistics[labels, cv2.CC_STAT_AREA] >= MIN_SHARE * hides.size)
 
 
 def _widened(area: np.ndarray) -> np.ndarray:

@@ -49,7 +49,12 @@ def initialize(overlay: ScreenSpaceOverlay, statistics: ImageStatistics, within:
 
 
 def estimate(
-    samples: PointSamples, guide: Tensor, opaque: Tensor, static: Tensor, falloff: Tensor | None = None
+    samples: PointSamples,
+    guide: Tensor,
+    opaque: Tensor,
+    static: Tensor,
+    falloff: Tensor | None = None,
+    always_hiding: Tensor | None = None,
 ) -> LayerEstimate:
     """Estimate an artifact's layers from samples of the scene's points.
 
@@ -60,6 +65,7 @@ def estimate(
             point says otherwise.
         static: [H, W] bool: where static edges are (`Detection.mask`): clear and opaque are equally likely there.
         falloff: of the lens, [h, w, 1], if it is known; None: it is estimated from the samples.
+        always_hiding: bool [h, w, 1], likewise: what is known to hide the scene in all photos; None: nothing.
     """
     reduction = working_reduction(*guide.shape[:2])
     # Photos that vary nowhere show no scene.
@@ -71,7 +77,9 @@ def estimate(
     if (falloff < 1).any():
         photos[..., :4] /= falloff
         samples = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
-    found = estimate_layers(samples, *photos.split((3, 1, 1, 1), dim=-1))
+    if always_hiding is not None:
+        photos[..., 4:5].clamp_min_(always_hiding.to(photos))
+    found = estimate_layers(samples, *photos.split((3, 1, 1, 1), dim=-1), always_hiding)
     return replace(found, falloff=falloff)
 
 

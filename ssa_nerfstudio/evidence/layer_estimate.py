@@ -102,7 +102,12 @@ class LayerEstimate:
 
 @torch.no_grad()
 def estimate_layers(
-    samples: PointSamples, mean: Tensor, deviation: Tensor, hidden: Tensor, static: Tensor
+    samples: PointSamples,
+    mean: Tensor,
+    deviation: Tensor,
+    hidden: Tensor,
+    static: Tensor,
+    always_hiding: Tensor | None = None,
 ) -> LayerEstimate:
     """Estimate T and B of every pixel.
 
@@ -116,10 +121,12 @@ def estimate_layers(
         deviation: of the photos, [h, w, 1], likewise; NaN where it is unknown.
         hidden: share of a working pixel that is known to be opaque, [h, w, 1] in [0, 1].
         static: share of a working pixel where static edges are, likewise.
+        always_hiding: bool [h, w, 1]: pixels that start as opaque, whatever their samples say of the points' colors,
+            because these may be behind the artifact in all photos. None: no such pixels are known.
     """
     height, width = samples.size
     observed, point, pixel = samples.color, samples.point, samples.pixel
-    colors, residual = _start(samples, mean, deviation)
+    colors, residual = _start(samples, mean, deviation, always_hiding)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
     layers = expected = expected_layers(samples, colors[point], mean, deviation, hidden, static)
     prior = torch.ones_like(layers[..., :1])
@@ -171,7 +178,9 @@ def robust_deviation(residuals: Tensor) -> Tensor:
     return 1.48 * residuals.abs().median() + GRAY_LEVEL
 
 
-def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tensor, Tensor]:
+def _start(
+    samples: PointSamples, mean: Tensor, deviation: Tensor, always_hiding: Tensor | None
+) -> tuple[Tensor, Tensor]:
     """First colors of the points [N, 3], and the residuals of their samples [S, 3].
 
     A color is the median of the point's samples, each weighed by how much the photos vary at its pixel: what is in
@@ -188,11 +197,15 @@ def _start(samples: PointSamples, mean: Tensor, deviation: Tensor) -> tuple[Tens
     weight = relative[samples.pixel].double() + _LEAST_WEIGHT
     constant = samples.color - mean.reshape(-1, 3)[samples.pixel]
     colors = _medians(samples, weight)
+    always = torch.zeros_like(samples.pixel, dtype=torch.bool)
+    if always_hiding is not None:
+        always = always_hiding.flatten()[samples.pixel]
     for _ in range(COLOR_ROUNDS):
-        hiding = _hiding(samples, samples.color - colors[samples.point], constant, MOST_SHOWN)
+        hiding = always | _hiding(samples, samples.color - colors[samples.point], constant, MOST_SHOWN)
         colors = _medians(samples, torch.where(hiding, _LEAST_WEIGHT * weight, weight))
     clear = samples.color - colors[samples.point]
-    return colors, torch.where(_hiding(samples, clear, constant, 0.5)[:, None], constant, clear)
+    hiding = always | _hiding(samples, clear, constant, 0.5)
+    return colors, torch.where(hiding[:, None], constant, clear)
 
 
 def _hiding(samples: PointSamples, clear: Tensor, constant: Tensor, shown: float) -> Tensor:

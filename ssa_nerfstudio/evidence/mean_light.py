@@ -1,7 +1,8 @@
-"""A second estimate of an artifact on which the light changes, from samples in its mean light."""
+"""A second estimate of an artifact on which the light changes: in its mean light, or of what follows it, too."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -11,6 +12,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.artifact_light import HIDING, MAX_COEFFICIENT, affine_terms, changing_light
 from ssa_nerfstudio.evidence.detection import Detection
+from ssa_nerfstudio.evidence.following_light import follows_light
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.initialization import estimate, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE, LayerEstimate, robust_deviation
@@ -22,12 +24,13 @@ from ssa_nerfstudio.overlay.shading import COEFFICIENTS, basis_of
 ROUNDS = 6
 """Of robust least squares, each with the variance that the coefficients of the round before have."""
 MOST_LEFT = 0.5
-"""Of the first estimate's squares where the artifact hides, the share below which the second holds: fingers to which it
-makes a difference leave 0.07 to 0.31, occlusions, a bonnet, a UI and a finger in constant light 0.89 to 1.14."""
+"""Of the first estimate's squares where the artifact hides, the share below which a light explains how photos differ
+there: fingers to which it makes a difference leave 0.07 to 0.31, occlusions, a bonnet, a UI and a finger in constant
+light 0.89 to 1.14."""
 
 
 class Refined(NamedTuple):
-    """The estimate that holds, and what a second one has told."""
+    """The last estimate, and what it has told."""
 
     layers: LayerEstimate
     may_move: bool
@@ -37,34 +40,32 @@ class Refined(NamedTuple):
 
 @dataclass(frozen=True)
 class SecondEstimate:
-    """Layers from samples in the artifact's mean light."""
+    """Layers from samples in the artifact's mean light, if that explains how they differ; else from those as they are,
+    of which more is known to hide the scene (`following_light.follows_light`)."""
 
     layers: LayerEstimate
     guide: Tensor
-    """Of the photos in that light (`initialization.guide_of`)."""
+    """Of the photos that were sampled, in the mean light or as they are (`initialization.guide_of`)."""
     left: float
-    """Squares that it leaves where the artifact hides, as a share of those that the first estimate leaves; NaN where no
-    sample is hidden."""
+    """Squares that layers in the mean light leave where the artifact hides, as a share of those that the first estimate
+    leaves; NaN where no sample is hidden."""
 
 
 def refine_in_mean_light(
     overlay: ScreenSpaceOverlay, found: LayerEstimate, second: SecondEstimate | None, static: Tensor
 ) -> Refined:
-    """Initialize the overlay from a second estimate, if that holds.
-
-    It holds where it leaves less than half of the first one's squares: where an artifact moves, a light explains little
-    of them.
+    """Initialize the overlay from a second estimate, if there is one.
 
     Args:
-        overlay: initialized from `found`; changed in place where the second estimate holds.
+        overlay: initialized from `found`; changed in place where there is a second estimate.
         found: the first estimate.
         second: the second (`second_estimate`).
         static: [H, W] bool: where static edges are (`Detection.mask`).
     """
-    if second is None or not second.left < MOST_LEFT:
-        return Refined(found, may_move=second is not None and second.left >= MOST_LEFT)
+    if second is None:
+        return Refined(found, may_move=False)
     initialize_from(overlay, second.layers, second.guide, static)
-    return Refined(second.layers, may_move=False)
+    return Refined(second.layers, may_move=second.left >= MOST_LEFT)
 
 
 @torch.no_grad()
@@ -76,11 +77,12 @@ def second_estimate(
     views: Sequence[View],
     detection: Detection,
 ) -> SecondEstimate | None:
-    """Estimate the layers once more; None where the light on them does not change.
+    """Estimate the layers once more; None where the light on them does not change, or no sample is hidden.
 
     To an estimate, changes of the light are noise, and some of it passes for scene. The colors of the points tell them
     apart: what the first estimate leaves of the samples is fitted by a light for each view, and the second is of the
-    samples without it.
+    samples without it. It holds where it leaves less than half of the first one's squares. Where an artifact moves, a
+    light explains little of them; but it shows what else belongs to the artifact, which another estimate then knows.
 
     Args:
         overlay: initialized from `found`.
@@ -98,9 +100,17 @@ def second_estimate(
     small = reduced(basis, working_reduction(overlay.height, overlay.width))
     coefficients = light_of_samples(samples, found, small, len(views))
     relit = in_mean_light(samples, found, small, coefficients)
-    guide = guide_in_mean_light(guide.to(device), basis, addition, coefficients)
-    second = estimate(relit, guide, detection.opaque, detection.mask, found.falloff)
-    return SecondEstimate(second, guide, _squares_left(relit, second, small) / _squares_left(samples, found, small))
+    steady = guide_in_mean_light(guide.to(device), basis, addition, coefficients)
+    second = estimate(relit, steady, detection.opaque, detection.mask, found.falloff)
+    left = _squares_left(relit, second, small) / _squares_left(samples, found, small)
+    if math.isnan(left):
+        return None
+    if left < MOST_LEFT:
+        return SecondEstimate(second, steady, left)
+    mean = reduced(guide[..., :3].to(device), working_reduction(overlay.height, overlay.width))
+    follows = follows_light(samples, found, small[..., :1], mean, coefficients)
+    second = estimate(samples, guide, detection.opaque, detection.mask, found.falloff, follows)
+    return SecondEstimate(second, guide, left)
 
 
 def light_of_samples(samples: PointSamples, found: LayerEstimate, basis: Tensor, views: int) -> Tensor:

@@ -18,7 +18,7 @@ COEFFICIENTS = 5
 """Number of coefficients: logarithms of the gains of red, green and blue in the middle of an opaque artifact, and their
 change to the right and downwards per standard deviation of its extent. Less where less is opaque."""
 _HALF_WIDTH = math.sqrt(3)
-"""Of an artifact of constant opacity, standard deviations of its extent. The light stays the same beyond."""
+"""Of an artifact of constant opacity, standard deviations of its extent."""
 
 
 def shading_basis(opacity: Tensor) -> Tensor:
@@ -29,6 +29,19 @@ def shading_basis(opacity: Tensor) -> Tensor:
     Args:
         opacity: of the artifact [h, w, 1] in [0, 1].
     """
+    coordinates = coordinates_of(opacity)
+    return torch.cat([opacity, opacity * coordinates], dim=-1)
+
+
+def coordinates_of(opacity: Tensor) -> Tensor:
+    """To the right and downwards from an artifact's middle, [h, w, 2], in standard deviations of its extent.
+
+    Args:
+        opacity: of the artifact [h, w, 1] in [0, 1].
+
+    Returns:
+        At most the square root of 3 in size: the light stays the same beyond.
+    """
     height, width = opacity.shape[:2]
     rows = torch.arange(height, dtype=opacity.dtype, device=opacity.device)[:, None, None]
     columns = torch.arange(width, dtype=opacity.dtype, device=opacity.device)[None, :, None]
@@ -38,7 +51,7 @@ def shading_basis(opacity: Tensor) -> Tensor:
         offset = place - (opacity * place).sum() / total
         deviation = ((opacity * offset.square()).sum() / total).sqrt().clamp_min(0.5)  # of an artifact of one pixel
         coordinates.append((offset / deviation).clamp(-_HALF_WIDTH, _HALF_WIDTH).expand_as(opacity))
-    return torch.cat([opacity, *(opacity * each for each in coordinates)], dim=-1)
+    return torch.cat(coordinates, dim=-1)
 
 
 def basis_of(overlay: ScreenSpaceOverlay, reduction: int = 1) -> Tensor:

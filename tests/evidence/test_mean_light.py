@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
 
 import pytest
@@ -16,7 +17,6 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initializ
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.mean_light import (
     Refined,
-    SecondEstimate,
     guide_in_mean_light,
     in_mean_light,
     light_of_samples,
@@ -45,15 +45,15 @@ def finger() -> tuple[torch.Tensor, torch.Tensor]:
     return 1 - opacity, opacity * COLOR
 
 
-def views(coefficients: torch.Tensor) -> list[View]:
-    """A camera that moves along the wall, behind a finger in this light [V, 5]."""
+def views(coefficients: torch.Tensor, vertically: float = 0.8) -> list[View]:
+    """A camera that moves along the wall, and so far up and down, behind a finger in this light [V, 5]."""
     generator, found = torch.Generator().manual_seed(3), []
     transmittance, addition = finger()
     basis = shading_basis(1 - transmittance)
     rows, columns = torch.meshgrid(torch.arange(HEIGHT) + 0.5, torch.arange(WIDTH) + 0.5, indexing="ij")
     for own in coefficients:
         pose = torch.eye(4)
-        pose[:2, 3] = 0.8 * torch.rand(2, generator=generator) - 0.4
+        pose[:2, 3] = torch.tensor([0.8, vertically]) * (torch.rand(2, generator=generator) - 0.5)
         wall = texture((columns - WIDTH / 2) / 100 - pose[0, 3], (rows - HEIGHT / 2) / 100 - pose[1, 3])
         photo = (transmittance * wall + light(basis, own) * addition).clamp(0, 1)
         found.append(View((255 * photo).round().to(torch.uint8), None, pose, K))
@@ -120,35 +120,63 @@ def test_the_second_estimate_is_told_how_much_photos_vary_without_the_light(monk
     torch.testing.assert_close(told[0][:, WIDTH // 2 :], start.guide[:, WIDTH // 2 :])
 
 
-def test_in_constant_light_the_first_estimate_holds():
+def test_in_constant_light_nothing_is_lost():
+    """What is smooth in the scene passes for light here."""
     start = Start(views(CONSTANT))
-    before = {name: value.clone() for name, value in start.overlay.state_dict().items()}
     layers, may_move = start.refined()
-    assert layers is start.found
-    # What is smooth in the scene passes for light here.
+    assert error(start.overlay) < 0.001
     assert not may_move or not moving_parts(layers, start.samples).any()
-    assert all(torch.equal(value, before[name]) for name, value in start.overlay.state_dict().items())
 
 
-def test_a_second_estimate_that_explains_little_is_dropped(monkeypatch):
+def test_where_light_explains_little_the_second_estimate_is_of_the_samples_as_they_are(monkeypatch):
     """As where an artifact moves, which passes for light."""
-    start = Start(views(CONSTANT))
+    start, told = Start(views(CONSTANT)), []
     monkeypatch.setattr(mean_light, "changing_light", lambda *given: "a light")
-    assert start.refined() == (start.found, True)
-    assert error(start.overlay) == start.error
+    monkeypatch.setattr(mean_light, "estimate", lambda *given: told.append(given) or estimate(*given))
+    assert start.refined().may_move
+    samples, guide, *_, follows = told[-1]
+    assert samples is start.samples
+    assert torch.equal(guide, start.guide)
+    assert not follows[:, WIDTH // 3 + 5 :].any()
+    assert error(start.overlay) < start.error + 0.02
 
 
-@pytest.mark.parametrize(
-    ("left", "holds", "may_move"),
-    [(0.49, True, False), (0.51, False, True), (1.1, False, True), (math.nan, False, False), (None, False, False)],
-)
-def test_how_much_is_left_decides_which_estimate_holds_and_whether_parts_may_move(left, holds, may_move):
+@pytest.mark.parametrize(("most", "may_move"), [(math.inf, False), (0.0, True)])
+def test_how_much_is_left_decides_which_second_estimate_is_made_and_whether_parts_may_move(monkeypatch, most, may_move):
+    start = Start(views(changing()))
+    monkeypatch.setattr(mean_light, "MOST_LEFT", most)
+    told = []
+    monkeypatch.setattr(mean_light, "estimate", lambda *given: told.append(given[0]) or estimate(*given))
+    second, moves = start.refined()
+    assert moves == may_move
+    assert start.overlay.noise == second.noise
+    assert (told[-1] is start.samples) == may_move, "as they are, or in the mean light"
+
+
+def test_points_that_are_always_behind_the_artifact_do_not_make_it_a_scene(monkeypatch):
+    """Of what the lower half hides, no photo shows anything beside it."""
+    monkeypatch.setattr(sys.modules[__name__], "TRANSMITTANCE", 0.05)
+    start = Start(views(changing(), vertically=0.0))
+    samples, lower = start.samples, WIDTH * HEIGHT // 2
+    inside = samples.pixel % WIDTH < WIDTH // 3
+    behind = torch.zeros(samples.points, dtype=torch.bool)
+    behind[samples.point[inside & (samples.pixel >= lower)]] = True
+    kept = inside | ~behind[samples.point]
+    fewer = {name: getattr(samples, name)[kept] for name in ("point", "pixel", "color", "view")}
+    start.samples = replace(samples, **fewer, patch=None)
+    start.found = estimate(start.samples, start.guide, start.detection.opaque, start.detection.mask)
+    initialize_from(start.overlay, start.found, start.guide, start.detection.mask)
+    before = error(start.overlay)
+    assert before > 0.1
+    monkeypatch.setattr(mean_light, "MOST_LEFT", 0.0)
+    start.refined()
+    assert error(start.overlay) < 0.7 * before
+
+
+def test_without_a_second_estimate_the_first_holds():
     start = Start(views(CONSTANT))
-    again = replace(start.found, noise=start.found.noise / 2)
-    second = None if left is None else SecondEstimate(again, start.guide, left)
-    refined = refine_in_mean_light(start.overlay, start.found, second, start.detection.mask)
-    assert refined == (again if holds else start.found, may_move)
-    assert start.overlay.noise == (again if holds else start.found).noise
+    assert refine_in_mean_light(start.overlay, start.found, None, start.detection.mask) == (start.found, False)
+    assert error(start.overlay) == start.error
 
 
 def rms(difference: torch.Tensor) -> float:
