@@ -75,8 +75,8 @@ def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
 def large_parts(estimate: LayerEstimate) -> np.ndarray:
     """Connected parts that hide more than half of the scene and cover MIN_SHARE of the frame: bool [h, w]."""
     hides = (estimate.opacity()[..., 0] > MIN_MEAN_OPACITY).cpu().numpy().astype(np.uint8)
-    _, labels, statistics, _ = cv2.connectedComponentsWithStats(hides, connectivity=8)
-    return (hides > 0) & (statistics[labels, cv2.CC_STAT_AREA] >= MIN_SHARE * hides.size)
+    labels = np.asarray(cv2.connectedComponents(hides, connectivity=8)[1])
+    return (hides > 0) & (np.bincount(labels.ravel())[labels] >= MIN_SHARE * hides.size)
 
 
 def _widened(area: np.ndarray) -> np.ndarray:

@@ -79,7 +79,8 @@ def estimate(
         samples = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()
     if always_hiding is not None:
         photos[..., 4:5].clamp_min_(always_hiding.to(photos))
-    found = estimate_layers(samples, *photos.split((3, 1, 1, 1), dim=-1), always_hiding)
+    mean, deviation, hiding, edges = photos.split((3, 1, 1, 1), dim=-1)
+    found = estimate_layers(samples, mean, deviation, hiding, edges, always_hiding)
     return replace(found, falloff=falloff)
 
 

@@ -194,7 +194,7 @@ def test_samples_start_by_how_much_comes_through_where_they_are(through: float, 
     mean, deviation = torch.full((HEIGHT, WIDTH, 3), BRIGHTEST / 2), torch.full((HEIGHT, WIDTH, 1), 0.17)
     mean[mark] = through * BRIGHTEST / 2 + (1 - through) * dark
     deviation[mark] *= max(through, 0.05)
-    first, residual = _start(samples, mean, deviation)
+    first, residual = _start(samples, mean, deviation, None)
     expected = colors.clone()
     if through > 1 / 3 or not beside:
         expected[::30] = through * colors[::30] + (1 - through) * dark
