@@ -75,8 +75,9 @@ def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
 def large_parts(estimate: LayerEstimate) -> np.ndarray:
     """Connected parts that hide more than half of the scene and cover MIN_SHARE of the frame: bool [h, w]."""
     hides = (estimate.opacity()[..., 0] > MIN_MEAN_OPACITY).cpu().numpy().astype(np.uint8)
-    labels = np.asarray(cv2.connectedComponents(hides, connectivity=8)[1])
-    return (hides > 0) & (np.bincount(labels.ravel())[labels] >= MIN_SHARE * hides.size)
+    labels = cv2.connectedComponents(hides, connectivity=8)[1].ravel().astype(np.intp)
+    large = np.bincount(labels)[labels] >= MIN_SHARE * hides.size
+    return (hides > 0) & large.reshape(hides.shape)
 
 
 def _widened(area: np.ndarray) -> np.ndarray:

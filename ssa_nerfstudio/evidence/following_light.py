@@ -74,8 +74,8 @@ def _around(samples: PointSamples, found: LayerEstimate, mean: Tensor, views: in
     shown = mean.reshape(-1, 3)[samples.pixel]
     moments = torch.cat([found.left_of(samples, every) * shown, shown.square()], dim=-1)
     moments = summed(samples.pixel * views + samples.view, moments, height * width * views)
-    around = local_mean(moments.reshape(height, width, -1), DETAIL_RADIUS)
-    return around.reshape(height * width, views, 2, 3).unbind(dim=2)
+    around = local_mean(moments.reshape(height, width, -1), DETAIL_RADIUS).reshape(height * width, views, 6)
+    return around[..., :3], around[..., 3:]
 
 
 def _fit(left: Tensor, weight: Tensor, terms: Tensor, products: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:

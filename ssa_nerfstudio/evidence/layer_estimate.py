@@ -197,9 +197,7 @@ def _start(
     weight = relative[samples.pixel].double() + _LEAST_WEIGHT
     constant = samples.color - mean.reshape(-1, 3)[samples.pixel]
     colors = _medians(samples, weight)
-    always = torch.zeros_like(samples.pixel, dtype=torch.bool)
-    if always_hiding is not None:
-        always = always_hiding.flatten()[samples.pixel]
+    always = False if always_hiding is None else always_hiding.flatten()[samples.pixel]
     for _ in range(COLOR_ROUNDS):
         hiding = always | _hiding(samples, samples.color - colors[samples.point], constant, MOST_SHOWN)
         colors = _medians(samples, torch.where(hiding, _LEAST_WEIGHT * weight, weight))
