@@ -19,6 +19,7 @@ from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
+from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
 from ssa_nerfstudio.overlay.shading import coordinates_of
 
 
@@ -35,7 +36,7 @@ def follows_light(
     the light is connected to a large part that hides the scene.
 
     The errors of samples in one photo are not independent. So their covariance is that of the photos' (a sandwich
-    estimator), and the test is Wald's.
+    estimator), and the test is Wald's. A regular subset of at most MAX_VIEWS photos counts.
 
     Args:
         samples: of the points, as photos show them.
@@ -47,7 +48,9 @@ def follows_light(
     hides = large_parts(found)
     if not hides.any():
         return torch.zeros_like(opacity, dtype=torch.bool)
-    left, weight = _around(samples, found, mean, len(coefficients))
+    every = -(-len(coefficients) // MAX_VIEWS)
+    coefficients = coefficients[::every]
+    left, weight = _around(samples, found, mean, every, len(coefficients))
     terms = torch.stack([torch.cat([coefficients[:, c, None], coefficients[:, 3:]], dim=1) for c in range(3)])
     products = torch.einsum("pvc,cvi,cvj->pij", weight, terms, terms)
     total = weight.sum(dim=(1, 2)).clamp_min(1e-12)
@@ -63,17 +66,23 @@ def follows_light(
     return torch.from_numpy(joined).to(mean.device)[..., None]
 
 
-def _around(samples: PointSamples, found: LayerEstimate, mean: Tensor, views: int) -> tuple[Tensor, Tensor]:
+def _around(samples: PointSamples, found: LayerEstimate, mean: Tensor, every: int, views: int) -> tuple[Tensor, Tensor]:
     """What is left of the samples of each photo around each pixel, times the photos' mean color, and squares of that.
 
+    Args:
+        samples, found, mean: as for `follows_light`.
+        every: so many photos are one that counts.
+        views: number V of these.
+
     Returns:
-        Sums over windows, [h w, V, 3] each.
+        Means over windows, [h w, V, 3 channels] each.
     """
     height, width = samples.size
-    every = torch.arange(len(samples.pixel), device=samples.pixel.device)
-    shown = mean.reshape(-1, 3)[samples.pixel]
-    moments = torch.cat([found.left_of(samples, every) * shown, shown.square()], dim=-1)
-    moments = summed(samples.pixel * views + samples.view, moments, height * width * views)
+    those = (samples.view % every == 0).nonzero()[:, 0]
+    pixel, view = samples.pixel[those], samples.view[those] // every
+    shown = mean.reshape(-1, 3)[pixel]
+    moments = torch.cat([found.left_of(samples, those) * shown, shown.square()], dim=-1)
+    moments = summed(pixel * views + view, moments, height * width * views)
     around = local_mean(moments.reshape(height, width, -1), DETAIL_RADIUS).reshape(height * width, views, 6)
     return around[..., :3], around[..., 3:]
 

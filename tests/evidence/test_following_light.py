@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from ssa_nerfstudio.evidence import following_light
 from ssa_nerfstudio.evidence.following_light import follows_light
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import PointSamples
@@ -166,3 +167,12 @@ def test_where_nothing_large_hides_the_scene_nothing_is_looked_for() -> None:
     clear = torch.zeros_like(found.transmittance)
     clear_found = replace(found, transmittance=1 - clear, addition=torch.zeros_like(found.addition))
     assert not followed(samples, clear_found).any()
+
+
+def test_of_many_photos_a_regular_subset_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    samples, found = photographed(shares(rest=(MISSED, 1.0)))
+    monkeypatch.setattr(following_light, "MAX_VIEWS", 12)
+    follows = followed(samples, found)
+    color = torch.where((samples.view % 2 == 0)[:, None], samples.color, 0.5)
+    assert torch.equal(followed(replace(samples, color=color), found), follows)
+    assert follows[within(MISSED, -4)].all()
