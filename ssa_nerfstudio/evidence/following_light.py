@@ -29,14 +29,17 @@ def follows_light(
 ) -> Tensor:
     """Where more than half of what photos show changes with the artifact's light: bool [h, w, 1], at the working size.
 
-    What an estimate leaves of the samples around a pixel, as a share of the photos' mean color, is fitted by the
-    artifact's light, whose coefficients are known: a g_i + b h_i + c v_i, by least squares. Either a, b and c are in
-    the proportion in which the artifact has them, 1, x and y, or they are any, because a highlight may lie elsewhere
-    here. The fit has to be significant, and its deviation more than HIDING times that of the light; and what follows
-    the light is connected to a large part that hides the scene.
+    What an estimate leaves of the samples around a pixel is fitted by what they would change if all that photos show
+    were the artifact: mean(I) (alpha g_i + beta h_i + gamma v_i), by least squares. Either alpha, beta and gamma are in
+    the proportion in which the artifact has them, 1, x and y, or they are any, of any sign, because a highlight may lie
+    elsewhere here, and what it leaves becomes darker. The fit has to be significant, and its standard deviation over
+    the photos more than HIDING times that of the light; and what follows the light is connected to a large part that
+    hides the scene. Samples where the estimate hides the scene, and where not, are not mixed: otherwise the rim of a
+    bright artifact would follow its light.
 
     The errors of samples in one photo are not independent. So their covariance is that of the photos' (a sandwich
-    estimator), and the test is Wald's. A regular subset of at most MAX_VIEWS photos counts.
+    estimator, of what a fit without a photo leaves of it), and the test is Wald's. A regular subset of at most
+    MAX_VIEWS photos counts.
 
     Args:
         samples: of the points, as photos show them.
@@ -49,39 +52,46 @@ def follows_light(
     if not hides.any():
         return torch.zeros_like(opacity, dtype=torch.bool)
     every = -(-len(coefficients) // MAX_VIEWS)
-    coefficients = coefficients[::every]
-    left, weight = _around(samples, found, mean, every, len(coefficients))
+    coefficients = coefficients[::every] - coefficients[::every].mean(dim=0)
     terms = torch.stack([torch.cat([coefficients[:, c, None], coefficients[:, 3:]], dim=1) for c in range(3)])
-    products = torch.einsum("pvc,cvi,cvj->pij", weight, terms, terms)
-    total = weight.sum(dim=(1, 2)).clamp_min(1e-12)
-    place = torch.cat([torch.ones_like(opacity), coordinates_of(opacity)], dim=-1).reshape(-1, 3, 1)
-    own = (place.mT @ products @ place)[:, 0, 0]
-    inside = torch.from_numpy(hides).flatten().to(own.device)
-    usual = total * own[inside].sum() / total[inside].sum()
-    follows = torch.zeros_like(inside)
-    for basis, full in ((place, own), (torch.eye(3).to(place).expand(len(place), 3, 3), usual)):
-        explained, certain = _fit(left, weight, terms, products, basis)
-        follows |= certain & (explained > HIDING**2 * full)
+    proportional = torch.cat([torch.ones_like(opacity), coordinates_of(opacity)], dim=-1).reshape(-1, 3, 1)
+    free = torch.eye(3).to(proportional).expand(len(proportional), 3, 3)
+    inside = torch.from_numpy(hides).flatten().to(proportional.device)
+    hidden = found.opacity().flatten() > HIDING
+    follows, usual = torch.zeros_like(inside), None
+    for those in (hidden, ~hidden):
+        left, weight = _around(samples, found, mean, those, every, len(coefficients))
+        products = torch.einsum("pvc,cvi,cvj->pij", weight, terms, terms)
+        total = weight.sum(dim=(1, 2))
+        there = (proportional.mT @ products @ proportional)[:, 0, 0]
+        if usual is None:
+            usual = there[inside].sum() / total[inside].sum().clamp_min(1e-12)
+        for basis, full_change in ((proportional, there), (free, usual * total)):
+            explained, certain = _fit(left, weight, terms, products, basis)
+            follows |= those & certain & (explained > HIDING**2 * full_change)
     joined = _connected(follows.reshape(hides.shape).cpu().numpy(), hides)
     return torch.from_numpy(joined).to(mean.device)[..., None]
 
 
-def _around(samples: PointSamples, found: LayerEstimate, mean: Tensor, every: int, views: int) -> tuple[Tensor, Tensor]:
+def _around(
+    samples: PointSamples, found: LayerEstimate, mean: Tensor, those: Tensor, every: int, views: int
+) -> tuple[Tensor, Tensor]:
     """What is left of the samples of each photo around each pixel, times the photos' mean color, and squares of that.
 
     Args:
         samples, found, mean: as for `follows_light`.
-        every: so many photos are one that counts.
+        those: working pixels whose samples count, bool [h w].
+        every: of so many photos one counts.
         views: number V of these.
 
     Returns:
         Means over windows, [h w, V, 3 channels] each.
     """
     height, width = samples.size
-    those = (samples.view % every == 0).nonzero()[:, 0]
-    pixel, view = samples.pixel[those], samples.view[those] // every
+    chosen = (those[samples.pixel] & (samples.view % every == 0)).nonzero()[:, 0]
+    pixel, view = samples.pixel[chosen], samples.view[chosen] // every
     shown = mean.reshape(-1, 3)[pixel]
-    moments = torch.cat([found.left_of(samples, those) * shown, shown.square()], dim=-1)
+    moments = torch.cat([found.left_of(samples, chosen) * shown, shown.square()], dim=-1)
     moments = summed(pixel * views + view, moments, height * width * views)
     around = local_mean(moments.reshape(height, width, -1), DETAIL_RADIUS).reshape(height * width, views, 6)
     return around[..., :3], around[..., 3:]
@@ -98,16 +108,20 @@ def _fit(left: Tensor, weight: Tensor, terms: Tensor, products: Tensor, basis: T
     """
     count = basis.shape[-1]
     sums = basis.mT @ torch.einsum("pvc,cvi->pi", left, terms)[..., None]
-    products = basis.mT @ products @ basis
-    solution = torch.linalg.solve(_regular(products), sums)
+    inverse = torch.linalg.inv(_regular(basis.mT @ products @ basis))
+    solution = inverse @ sums
+    spread = basis @ inverse @ basis.mT
+    # The trace of a photo's leverage: exact for one term, and too much for three.
+    leverage = (weight * torch.einsum("pij,cvi,cvj->pvc", spread, terms, terms)).sum(dim=2)
     residual = left - weight * torch.einsum("pi,cvi->pvc", (basis @ solution)[..., 0], terms)
-    scores = torch.einsum("pvc,cvi->pvi", residual, terms) @ basis
-    photos = weight.sum(dim=2)
-    photos = photos.sum(dim=1).square() / photos.square().sum(dim=1).clamp_min(1e-12)
-    unknown = (photos - count).clamp_min(1e-3)
-    wald = (sums.mT @ torch.linalg.solve(_regular(scores.mT @ scores), sums))[:, 0, 0] * unknown / (count * photos)
-    certain = torch.from_numpy(fdtri(count, unknown.cpu().numpy(), 1 - SIGNIFICANCE)).to(wald)
-    return (solution.mT @ sums)[:, 0, 0], wald > certain
+    scores = torch.einsum("pvc,cvi->pvi", residual, terms) @ basis / (1 - leverage).clamp_min(1e-3)[..., None]
+    of_photo = weight.sum(dim=2)
+    effective = of_photo.sum(dim=1).square() / of_photo.square().sum(dim=1).clamp_min(1e-12)
+    freedom = (effective - count).clamp_min(1e-3)
+    wald = (sums.mT @ torch.linalg.solve(_regular(scores.mT @ scores), sums))[:, 0, 0] / count
+    # Two fits are tested.
+    critical = torch.from_numpy(fdtri(count, freedom.cpu().numpy(), 1 - SIGNIFICANCE / 2)).to(wald)
+    return (solution.mT @ sums)[:, 0, 0], wald * freedom / effective > critical
 
 
 def _regular(matrices: Tensor) -> Tensor:

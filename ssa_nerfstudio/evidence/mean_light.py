@@ -48,7 +48,7 @@ class SecondEstimate:
     """Of the photos that were sampled, in the mean light or as they are (`initialization.guide_of`)."""
     left: float
     """Squares that layers in the mean light leave where the artifact hides, as a share of those that the first estimate
-    leaves; NaN where no sample is hidden."""
+    leaves."""
 
 
 def refine_in_mean_light(
@@ -109,6 +109,8 @@ def second_estimate(
         return SecondEstimate(second, steady, left)
     mean = reduced(guide[..., :3].to(device), working_reduction(overlay.height, overlay.width))
     follows = follows_light(samples, found, small[..., :1], mean, coefficients)
+    if not follows.any():
+        return SecondEstimate(found, guide, left)
     second = estimate(samples, guide, detection.opaque, detection.mask, found.falloff, follows)
     return SecondEstimate(second, guide, left)
 
