@@ -115,13 +115,13 @@ def _fit(left: Tensor, weight: Tensor, terms: Tensor, products: Tensor, basis: T
     leverage = (weight * torch.einsum("pij,cvi,cvj->pvc", spread, terms, terms)).sum(dim=2)
     residual = left - weight * torch.einsum("pi,cvi->pvc", (basis @ solution)[..., 0], terms)
     scores = torch.einsum("pvc,cvi->pvi", residual, terms) @ basis / (1 - leverage).clamp_min(1e-3)[..., None]
-    of_photo = weight.sum(dim=2)
-    effective = of_photo.sum(dim=1).square() / of_photo.square().sum(dim=1).clamp_min(1e-12)
-    freedom = (effective - count).clamp_min(1e-3)
+    # Few photos may have most of the light, and then as few tell how certain the fit is.
+    photos = leverage.sum(dim=1).square() / leverage.square().sum(dim=1).clamp_min(1e-12)
+    freedom = (photos - count).clamp_min(1e-3)
     wald = (sums.mT @ torch.linalg.solve(_regular(scores.mT @ scores), sums))[:, 0, 0] / count
     # Two fits are tested.
     critical = torch.from_numpy(fdtri(count, freedom.cpu().numpy(), 1 - SIGNIFICANCE / 2)).to(wald)
-    return (solution.mT @ sums)[:, 0, 0], wald * freedom / effective > critical
+    return (solution.mT @ sums)[:, 0, 0], wald * freedom / photos > critical
 
 
 def _regular(matrices: Tensor) -> Tensor:

@@ -176,3 +176,42 @@ def test_of_many_photos_a_regular_subset_counts(monkeypatch: pytest.MonkeyPatch)
     color = torch.where((samples.view % 2 == 0)[:, None], samples.color, 0.5)
     assert torch.equal(followed(replace(samples, color=color), found), follows)
     assert follows[within(MISSED, -4)].all()
+
+
+@pytest.mark.parametrize("beside", [0.1, 0.3])
+def test_the_rim_of_a_bright_artifact_does_not_follow_its_light(beside: float) -> None:
+    samples, found = photographed(opacity_found())
+    bright = torch.where(opacity_found() > 0, 0.8, beside).expand(HEIGHT, WIDTH, 3)
+    scale = (bright / ARM).reshape(-1, 3)[samples.pixel]
+    samples = replace(samples, color=samples.color * scale)
+    assert found.colors is not None
+    colors = found.colors * (bright / ARM).reshape(-1, 3)
+    found = replace(found, addition=found.opacity() * bright, colors=colors)
+    follows = follows_light(samples, found, found.opacity(), bright, LIGHT)[..., 0]
+    assert follows[within(FOUND, -2)].all()
+    assert not follows[~within(FOUND, 0)].any()
+
+
+def test_light_in_one_photo_and_a_change_of_the_scene_in_it_are_chance() -> None:
+    once = torch.zeros(VIEWS, COEFFICIENTS)
+    once[7, :3] = 0.5
+    once = once - once.mean(dim=0)
+    own = torch.randn(VIEWS, generator=torch.Generator().manual_seed(3))
+    own[7] = 3.0
+    place = torch.zeros(HEIGHT, WIDTH, 1)
+    place[MISSED] = 1.0
+    changes = 0.15 * (own - own.mean())[:, None, None, None] * place * ARM
+    assert not followed(*photographed(opacity_found(), once, changes), once)[within(MISSED, -4)].any()
+
+
+def test_by_chance_few_photos_agree_rarely() -> None:
+    """Changes of a scene in eight photos, drawn 60 times: the test's level is 0.01."""
+    few = LIGHT[:8] - LIGHT[:8].mean(dim=0)
+    terms = torch.stack([torch.cat([few[:, c, None], few[:, 3:]], dim=1) for c in range(3)])
+    generator = torch.Generator().manual_seed(6)
+    own = torch.randn(3000, 8, 1, generator=generator)
+    left, weight = own.expand(-1, -1, 3), torch.ones(3000, 8, 3)
+    products = torch.einsum("pvc,cvi,cvj->pij", weight, terms, terms)
+    free = torch.eye(3).expand(3000, 3, 3)
+    for basis, most in ((free[..., :1], 0.03), (free, 0.05)):
+        assert following_light._fit(left, weight, terms, products, basis)[1].float().mean() < most

@@ -204,6 +204,26 @@ def test_samples_start_by_how_much_comes_through_where_they_are(through: float, 
     torch.testing.assert_close(residual, torch.where(hiding, opaque, samples.color - first[samples.point]))
 
 
+@pytest.mark.parametrize("known", [False, True])
+def test_what_always_hides_starts_as_opaque_and_has_no_say_in_the_points_colors(known: bool) -> None:
+    """A mark in the colors that the points seem to have, as where these are behind it in nearly all photos."""
+    generator = torch.Generator().manual_seed(0)
+    mark = disc(0.02, 0.4)[..., 0] > 0.5
+    marked, others = mark.flatten().nonzero()[:, 0], (~mark).flatten().nonzero()[:, 0]
+    points, views = 200, 12
+    point, view = torch.arange(points).repeat_interleave(views), torch.arange(views).repeat(points)
+    behind = view > 1
+    colors, paint = torch.rand(points, 3, generator=generator), torch.rand(points, 3, generator=generator)
+    places = [each[torch.randint(len(each), (len(point),), generator=generator)] for each in (marked, others)]
+    shown = torch.where(behind[:, None], paint[point], colors[point])
+    samples = PointSamples(point, torch.where(behind, *places), shown, points, (HEIGHT, WIDTH), view).ordered()
+    mean, deviation = torch.full((HEIGHT, WIDTH, 3), 0.5), torch.full((HEIGHT, WIDTH, 1), 0.17)
+    first, residual = _start(samples, mean, deviation, mark[..., None] if known else None)
+    assert torch.equal(first, colors if known else paint)
+    inside = mark.flatten()[samples.pixel]
+    torch.testing.assert_close(residual[inside], (samples.color - (0.5 if known else first[samples.point]))[inside])
+
+
 def test_a_film_over_a_plain_part_of_the_scene_is_not_taken_for_opaque() -> None:
     """A path that stays in the middle of the frame, all of one color: photos hardly vary there, yet it is seen."""
     plain, color, through = disc(0.02)[..., 0] > 0.5, torch.tensor([0.4, 0.35, 0.3]), 0.8
