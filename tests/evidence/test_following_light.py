@@ -169,6 +169,15 @@ def test_where_nothing_large_hides_the_scene_nothing_is_looked_for() -> None:
     assert not followed(samples, clear_found).any()
 
 
+def test_what_is_found_by_few_samples_is_found_by_those_around() -> None:
+    """One pixel in nine has samples."""
+    samples, found = photographed(shares(rest=(MISSED, 1.0)))
+    rows, columns = samples.pixel // WIDTH, samples.pixel % WIDTH
+    kept = (rows % 3 == 0) & (columns % 3 == 0)
+    fewer = {name: getattr(samples, name)[kept] for name in ("point", "pixel", "color", "view")}
+    assert followed(replace(samples, **fewer), found)[within(MISSED, -4)].all()
+
+
 def test_of_many_photos_a_regular_subset_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     samples, found = photographed(shares(rest=(MISSED, 1.0)))
     monkeypatch.setattr(following_light, "MAX_VIEWS", 12)

@@ -138,6 +138,9 @@ def test_where_light_explains_little_the_second_estimate_is_of_the_samples_as_th
     assert torch.equal(guide, start.guide)
     assert not follows[:, WIDTH // 3 + 5 :].any()
     assert error(start.overlay) < start.error + 0.02
+    again = second_estimate(start.overlay, start.found, start.samples, start.guide, start.photos, start.detection)
+    assert again is not None
+    assert torch.equal(again.guide, start.guide), "in the light of each photo"
 
 
 @pytest.mark.parametrize(("most", "may_move"), [(math.inf, False), (0.0, True)])
