@@ -55,20 +55,21 @@ def follows_light(
     coefficients = coefficients[::every] - coefficients[::every].mean(dim=0)
     terms = torch.stack([torch.cat([coefficients[:, c, None], coefficients[:, 3:]], dim=1) for c in range(3)])
     proportional = torch.cat([torch.ones_like(opacity), coordinates_of(opacity)], dim=-1).reshape(-1, 3, 1)
-    free = torch.eye(3).to(proportional).expand(len(proportional), 3, 3)
     inside = torch.from_numpy(hides).flatten().to(proportional.device)
     hidden = found.opacity().flatten() > HIDING
     follows, usual = torch.zeros_like(inside), None
     for those in (hidden, ~hidden):
         left, weight = _around(samples, found, mean, those, every, len(coefficients))
         products = torch.einsum("pvc,cvi,cvj->pij", weight, terms, terms)
-        total = weight.sum(dim=(1, 2))
-        there = (proportional.mT @ products @ proportional)[:, 0, 0]
+        total, own = weight.sum(dim=(1, 2)), proportional[those]
+        there = (own.mT @ products @ own)[:, 0, 0]
         if usual is None:
-            usual = there[inside].sum() / total[inside].sum().clamp_min(1e-12)
-        for basis, full_change in ((proportional, there), (free, usual * total)):
+            large = inside[those]
+            usual = there[large].sum() / total[large].sum().clamp_min(1e-12)
+        free = torch.eye(3).to(own).expand(len(own), 3, 3)
+        for basis, full_change in ((own, there), (free, usual * total)):
             explained, certain = _fit(left, weight, terms, products, basis)
-            follows |= those & certain & (explained > HIDING**2 * full_change)
+            follows[those] |= certain & (explained > HIDING**2 * full_change)
     joined = _connected(follows.reshape(hides.shape).cpu().numpy(), hides)
     return torch.from_numpy(joined).to(mean.device)[..., None]
 
@@ -85,7 +86,7 @@ def _around(
         views: number V of these.
 
     Returns:
-        Means over windows, [h w, V, 3 channels] each.
+        Means over windows around these pixels, [N, V, 3 channels] each.
     """
     height, width = samples.size
     chosen = (those[samples.pixel] & (samples.view % every == 0)).nonzero()[:, 0]
@@ -93,7 +94,7 @@ def _around(
     shown = mean.reshape(-1, 3)[pixel]
     moments = torch.cat([found.left_of(samples, chosen) * shown, shown.square()], dim=-1)
     moments = summed(pixel * views + view, moments, height * width * views)
-    around = local_mean(moments.reshape(height, width, -1), DETAIL_RADIUS).reshape(height * width, views, 6)
+    around = local_mean(moments.reshape(height, width, -1), DETAIL_RADIUS).reshape(height * width, views, 6)[those]
     return around[..., :3], around[..., 3:]
 
 
