@@ -8,9 +8,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import torch
+from torch import Tensor
 
 from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, MIN_SHARE, LayerEstimate, robust_deviation
 from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.evidence.static_area import connected_parts
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 USUAL = 0.99
@@ -58,26 +60,24 @@ def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
         samples: that it is of, as photos show them (behind a falloff).
     """
     limit = MOST_LEFT_BEHIND * float(estimate.noise) ** 2
-    labels = cv2.connectedComponents(large_parts(estimate).astype(np.uint8), connectivity=8)[1]
-    kept = np.zeros_like(labels, dtype=np.uint8)
-    for part in range(1, labels.max() + 1):
-        inside = torch.from_numpy(labels.ravel() == part).to(samples.pixel.device)
-        those = inside[samples.pixel].nonzero()[:, 0]
+    parts = large_parts(estimate)
+    of_sample, kept = parts.flatten()[samples.pixel], torch.zeros_like(parts, dtype=torch.bool)
+    for part in parts[parts > 0].unique():
+        those = (of_sample == part).nonzero()[:, 0]
         if len(those) < MIN_SAMPLES:
             continue
         # Without the falloff, as the noise is.
         left = estimate.left_of(samples, those) / estimate.falloff.reshape(-1, 1)[samples.pixel[those]]
         if float(robust_deviation(left)) ** 2 > limit + _ROUNDING:
-            kept[labels == part] = 1
-    return _widened(kept)
+            kept |= parts == part
+    return _widened(kept.cpu().numpy())
 
 
-def large_parts(estimate: LayerEstimate) -> np.ndarray:
-    """Connected parts that hide more than half of the scene and cover MIN_SHARE of the frame: bool [h, w]."""
-    hides = (estimate.opacity()[..., 0] > MIN_MEAN_OPACITY).cpu().numpy().astype(np.uint8)
-    labels = cv2.connectedComponents(hides, connectivity=8)[1].ravel().astype(np.intp)
-    large = np.bincount(labels)[labels] >= MIN_SHARE * hides.size
-    return (hides > 0) & large.reshape(hides.shape)
+def large_parts(estimate: LayerEstimate) -> Tensor:
+    """Number the connected parts that hide more than half of the scene and cover MIN_SHARE of the frame: int64 [h, w],
+    0 elsewhere."""
+    parts = connected_parts(estimate.opacity()[..., 0] > MIN_MEAN_OPACITY)
+    return torch.where(parts.flatten().bincount()[parts] < MIN_SHARE * parts.numel(), 0, parts)
 
 
 def _widened(area: np.ndarray) -> np.ndarray:

@@ -6,8 +6,6 @@ photo that it is seen in: then its color is the arm's, and the arm passes for sc
 
 from __future__ import annotations
 
-import cv2
-import numpy as np
 import torch
 from scipy.special import fdtri
 from torch import Tensor
@@ -20,6 +18,7 @@ from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
+from ssa_nerfstudio.evidence.static_area import connected_parts
 from ssa_nerfstudio.overlay.shading import coordinates_of
 
 
@@ -48,30 +47,31 @@ def follows_light(
         mean: of the photos, [h, w, 3].
         coefficients: the light in each photo, [V, COEFFICIENTS] (`mean_light.light_of_samples`).
     """
-    hides = large_parts(found)
+    hides = large_parts(found) > 0
     if not hides.any():
         return torch.zeros_like(opacity, dtype=torch.bool)
     every = -(-len(coefficients) // MAX_VIEWS)
     coefficients = coefficients[::every] - coefficients[::every].mean(dim=0)
     terms = torch.stack([torch.cat([coefficients[:, c, None], coefficients[:, 3:]], dim=1) for c in range(3)])
     proportional = torch.cat([torch.ones_like(opacity), coordinates_of(opacity)], dim=-1).reshape(-1, 3, 1)
-    inside = torch.from_numpy(hides).flatten().to(proportional.device)
     hidden = found.opacity().flatten() > HIDING
-    follows, usual = torch.zeros_like(inside), None
+    follows, usual = torch.zeros_like(hidden), None
     for those in (hidden, ~hidden):
         left, weight = _around(samples, found, mean, those, every, len(coefficients))
         products = torch.einsum("pvc,cvi,cvj->pij", weight, terms, terms)
+        sums = torch.einsum("pvc,cvi->pi", left, terms)[..., None]
         total, own = weight.sum(dim=(1, 2)), proportional[those]
         there = (own.mT @ products @ own)[:, 0, 0]
         if usual is None:
-            large = inside[those]
+            large = hides.flatten()[those]
             usual = there[large].sum() / total[large].sum().clamp_min(1e-12)
         free = torch.eye(3).to(own).expand(len(own), 3, 3)
         for basis, full_change in ((own, there), (free, usual * total)):
-            explained, certain = _fit(left, weight, terms, products, basis)
+            explained, certain = _fit(left, weight, terms, products, sums, basis)
             follows[those] |= certain & (explained > HIDING**2 * full_change)
-    joined = _connected(follows.reshape(hides.shape).cpu().numpy(), hides)
-    return torch.from_numpy(joined).to(mean.device)[..., None]
+    follows = follows.reshape(hides.shape)
+    parts = connected_parts(follows | hides)
+    return (follows & torch.isin(parts, parts[hides]))[..., None]
 
 
 def _around(
@@ -98,17 +98,19 @@ def _around(
     return around[..., :3], around[..., 3:]
 
 
-def _fit(left: Tensor, weight: Tensor, terms: Tensor, products: Tensor, basis: Tensor) -> tuple[Tensor, Tensor]:
+def _fit(
+    left: Tensor, weight: Tensor, terms: Tensor, products: Tensor, sums: Tensor, basis: Tensor
+) -> tuple[Tensor, Tensor]:
     """Squares that the light explains of what is left, [N], and whether they are significant, bool [N].
 
     Args:
         left, weight: see `_around`, [N, V, 3 channels].
         terms: gain and slopes of the light in each photo, [3 channels, V, 3].
-        products: of these under the weights, [N, 3, 3].
+        products, sums: of these with each other under the weights, [N, 3, 3], and with what is left, [N, 3, 1].
         basis: of the combinations of these that are fitted, [N, 3, K].
     """
     count = basis.shape[-1]
-    sums = basis.mT @ torch.einsum("pvc,cvi->pi", left, terms)[..., None]
+    sums = basis.mT @ sums
     inverse = torch.linalg.inv(_regular(basis.mT @ products @ basis))
     solution = inverse @ sums
     spread = basis @ inverse @ basis.mT
@@ -129,9 +131,3 @@ def _regular(matrices: Tensor) -> Tensor:
     """Symmetric matrices [N, K, K] that can be inverted."""
     ridge = 1e-6 * matrices.diagonal(dim1=1, dim2=2).amax(dim=1) + 1e-20
     return matrices + ridge[:, None, None] * torch.eye(matrices.shape[-1]).to(matrices)
-
-
-def _connected(follows: np.ndarray, hides: np.ndarray) -> np.ndarray:
-    """What of an area is connected to another, at most through itself: bool [h, w]."""
-    parts = cv2.connectedComponents((follows | hides).astype(np.uint8), connectivity=8)[1]
-    return follows & np.isin(parts, np.setdiff1d(parts[hides], 0))

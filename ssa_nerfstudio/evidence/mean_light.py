@@ -94,21 +94,21 @@ def second_estimate(
     """
     device = samples.color.device
     basis, (transmittance, addition) = basis_of(overlay).to(device), (layer.to(device) for layer in overlay.layers())
+    guide, reduction = guide.to(device), working_reduction(overlay.height, overlay.width)
     images, masks = [view.image for view in views], [view.mask for view in views]
     if found.colors is None or changing_light(images, masks, basis, (transmittance, addition)) is None:
         return None
-    small = reduced(basis, working_reduction(overlay.height, overlay.width))
+    small = reduced(basis, reduction)
     coefficients = light_of_samples(samples, found, small, len(views))
     relit = in_mean_light(samples, found, small, coefficients)
-    steady = guide_in_mean_light(guide.to(device), basis, addition, coefficients)
+    steady = guide_in_mean_light(guide, basis, addition, coefficients)
     second = estimate(relit, steady, detection.opaque, detection.mask, found.falloff)
     left = _squares_left(relit, second, small) / _squares_left(samples, found, small)
     if math.isnan(left):
         return None
     if left < MOST_LEFT:
         return SecondEstimate(second, steady, left)
-    mean = reduced(guide[..., :3].to(device), working_reduction(overlay.height, overlay.width))
-    follows = follows_light(samples, found, small[..., :1], mean, coefficients)
+    follows = follows_light(samples, found, small[..., :1], reduced(guide[..., :3], reduction), coefficients)
     if not follows.any():
         return SecondEstimate(found, guide, left)
     second = estimate(samples, guide, detection.opaque, detection.mask, found.falloff, follows)

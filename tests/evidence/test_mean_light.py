@@ -182,6 +182,14 @@ def test_points_that_are_always_behind_the_artifact_do_not_make_it_a_scene(monke
     assert error(start.overlay, 0.05) < 0.7 * before
 
 
+def test_without_a_hidden_sample_there_is_no_second_estimate():
+    start = Start(views(changing()))
+    shown = start.samples.pixel % WIDTH >= WIDTH // 2
+    fewer = {name: getattr(start.samples, name)[shown] for name in ("point", "pixel", "color", "view")}
+    samples = replace(start.samples, **fewer, patch=None)
+    assert second_estimate(start.overlay, start.found, samples, start.guide, start.photos, start.detection) is None
+
+
 def test_without_a_second_estimate_the_first_holds():
     start = Start(views(CONSTANT))
     assert refine_in_mean_light(start.overlay, start.found, None, start.detection.mask) == (start.found, False)
