@@ -2,7 +2,8 @@
 
 Of clean datasets it is the error where nothing is in front. `light`: how much of what the scene leaves unexplained a
 light for each photo explains, over the share `hidden` of the frame (`evidence.artifact_light`); `left`: what a second
-estimate leaves of the squares that the first leaves there (`evidence.mean_light`).
+estimate leaves of the squares that the first leaves there (`evidence.mean_light`); `held_out`: how far samples lie from
+layers and colors that were estimated without them, as the mean of Cauchy's log(1 + r^2 / s^2), which needs no truth.
 """
 
 from __future__ import annotations
@@ -11,9 +12,9 @@ import importlib
 import json
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,10 +29,11 @@ from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.artifact_light import ArtifactLight, artifact_light
 from ssa_nerfstudio.evidence.detection import Detection, detect
+from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
-from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
+from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE, LayerEstimate
 from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light, second_estimate
-from ssa_nerfstudio.evidence.point_samples import View, sample_points
+from ssa_nerfstudio.evidence.point_samples import PointSamples, View, sample_points
 from ssa_nerfstudio.evidence.scene_photos import scene_photos
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
@@ -60,19 +62,24 @@ DETECTION = {
 ESTIMATE = {
     "point_samples": ("WORKING_SIZE", "OCCLUSION_TOLERANCE", "OCCLUSION_RADIUS"),
     "expected_layers": ("DETAIL_RADIUS",),
+    "first_colors": ("COLOR_ROUNDS", "MOST_SHOWN"),
     "layer_estimate": (
         "ROUNDS",
-        "COLOR_ROUNDS",
-        "MOST_SHOWN",
         "CONJUGATE_GRADIENT_STEPS",
         "PRIOR_SCALE",
         "SMOOTHNESS_FLOOR",
+        "CHANGE_RATIO",
         "OUTLIER_SCALE",
         "CLEAR_SHARE",
+        "LIGHT_SHARE",
     ),
     "guided_upsampling": ("RADIUS",),
 }
 """Those of the modules that estimate the layers."""
+HELD_OUT = "", "first_colors", "expected_layers", "layer_estimate"
+"""Modules whose constants leave the samples as they are, so that held-out ones can be compared."""
+FOLDS = 5
+"""A sample in so many is held out."""
 SEEDS = {
     "distant_points": ("SPACING", "DISTANCE", "NOISE", "PATCH", "SIGNIFICANCE", "MIN_SIGHTS"),
     "gap_points": ("SPACING", "NEIGHBORS", "FLATNESS", "CLEAR_BY", "MAX_VIEWS"),
@@ -89,6 +96,8 @@ class Command:
     """Datasets that `ssa simulate` has written, or clean ones."""
     vary: bool = False
     """Also halve and double each constant, of more seeds, too, of which their number is told."""
+    held_out: bool = False
+    """Also predict samples that are held out, for constants of the estimate alone."""
     first: bool = False
     """Also measure the first estimate alone, named so as a constant. A second one is made where the light changes."""
     output: Annotated[Path, file_to_write()] | None = None
@@ -114,7 +123,7 @@ class Command:
         variants += [(FIRST, 1.0)] * self.first
         for path in self.data:
             missing = [variant for variant in variants if (path.name, *variant) not in known]
-            for result in _measure(path, missing):
+            for result in _measure(path, missing, self.held_out):
                 known[path.name, result["constant"], result["factor"]] = result
                 print("  ".join(f"{key} {value}" for key, value in result.items()), flush=True)
                 if self.output is not None:
@@ -139,14 +148,11 @@ def _check(path: Path) -> None:
         raise InputError(f"{path} has no {LAYERS}, though its scene.yaml names effects", "make it with ssa simulate")
 
 
-def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str, Any]]:
-    """Errors of the start with each variant of the constants."""
-    if not variants:
-        return
+def _views(path: Path) -> tuple[torch.Tensor, list[View]]:
+    """Points [N, 3] and training photos of a dataset, as a training reads them."""
     from nerfstudio.data.datamanagers.full_images_datamanager import FullImageDatamanager
 
     from ssa_nerfstudio.experiments.runs.run_configuration import configure
-    from ssa_nerfstudio.plugin.extra_seeds import seeds_between
     from ssa_nerfstudio.plugin.view_geometry import view_matrix
 
     config = configure("ssa-splatfacto", path, Path("outputs"), 1)
@@ -155,7 +161,16 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     photos, cameras = manager.cached_train, manager.train_dataset.cameras
     points = manager.train_dataparser_outputs.metadata["points3D_xyz"]
     poses, lenses = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
-    views = [View(photo["image"], photo.get("mask"), poses[i], lenses[i]) for i, photo in enumerate(photos)]
+    return points, [View(photo["image"], photo.get("mask"), poses[i], lenses[i]) for i, photo in enumerate(photos)]
+
+
+def _measure(path: Path, variants: list[tuple[str, float]], held_out: bool) -> Iterator[dict[str, Any]]:
+    """Errors of the start with each variant of the constants."""
+    if not variants:
+        return
+    from ssa_nerfstudio.plugin.extra_seeds import seeds_between
+
+    points, views = _views(path)
     statistics = accumulate((view.image, view.mask) for view in views)
     plain, guide = detect(statistics), guide_of(statistics)
     truth = torch.cat([torch.ones(*statistics.size, 1), torch.zeros(*statistics.size, 3)], dim=-1)
@@ -165,6 +180,7 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
+    distance = _distance_of_others(sample_points(points, views, guide), guide, plain) if held_out else None
     second: dict[str, float] = {}  # what a second estimate would leave, beside the first
 
     def start(detection: Detection, refine: bool = True) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
@@ -182,6 +198,10 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
     own = None
     for constant, factor in variants:
         started, module, seeds = time.monotonic(), constant.split(".")[0], {}
+        others = {}
+        if distance is not None and module in HELD_OUT:
+            with _scaled(constant, factor):
+                others = {"held_out": round(distance(), 5)}
         if constant == FIRST:
             detection, found, overlay = start(plain, refine=False)
         elif module in SEEDS or not constant:
@@ -215,8 +235,23 @@ def _measure(path: Path, variants: list[tuple[str, float]]) -> Iterator[dict[str
             "share": round(found.share(), 4),
             "seconds": round(time.monotonic() - started, 1),
             **(second if constant == FIRST else {}),
+            **others,
             **seeds,
         }
+
+
+def _distance_of_others(samples: PointSamples, guide: torch.Tensor, detection: Detection) -> Callable[[], float]:
+    """What measures held-out samples by the estimate's constants at the time, in units of the noise by the present."""
+    falloff = estimate_falloff(samples)
+    away = (samples.view + samples.point) % FOLDS == 0
+    parts = {name: getattr(samples, name)[~away] for name in ("point", "pixel", "color", "view")}
+    kept, those = replace(samples, **parts, patch=None), away.nonzero()[:, 0]
+
+    def found() -> LayerEstimate:
+        return estimate(kept, guide, detection.opaque, detection.mask, falloff)
+
+    scale = OUTLIER_SCALE * found().noise
+    return lambda: float(torch.log1p(found().left_of(samples, those).square().mean(dim=-1) / scale**2).mean())
 
 
 def _light_of(views: list[View], overlay: ScreenSpaceOverlay) -> ArtifactLight:
@@ -273,10 +308,12 @@ def _print_sensitivity(
             any(row[key] != before[key] for key in ("verdict", "adds_light"))
             for row, before in zip(rows, plain, strict=True)
         )
-        return f"{on:.3f} | {off:.3f} | {changed}"
+        others = [row["held_out"] for row in rows if "held_out" in row]
+        return f"{on:.3f} | {off:.3f} | {changed}" + ((f" | {np.mean(others):.4f}" if others else " | ") * predicted)
 
-    columns = "there | elsewhere | verdicts changed"
-    print(f"\n| constant | half: {columns} | twice: {columns} |\n|{'---|' * 7}")
+    predicted = any("held_out" in row for row in known.values())
+    columns = "there | elsewhere | verdicts changed" + " | held out" * predicted
+    print(f"\n| constant | half: {columns} | twice: {columns} |\n|{'---|' * (9 if predicted else 7)}")
     print(f"| all as they are | {errors('', 1.0)} | {errors('', 1.0)} |")
     for constant in constants:
         print(f"| {constant} | {errors(constant, 0.5)} | {errors(constant, 2.0)} |")

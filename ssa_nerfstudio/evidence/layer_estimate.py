@@ -10,11 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ssa_nerfstudio._system.in_place_graphs import repeat
 from ssa_nerfstudio.evidence.edge_evidence import EVIDENCE_THRESHOLDS
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS, expected_layers
+from ssa_nerfstudio.evidence.first_colors import first_colors
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
@@ -24,14 +25,13 @@ from ssa_nerfstudio.overlay.resampling import smallest_matte
 ROUNDS = 8
 """Alternations between layers and colors of points; the last half under the sparse prior."""
 CONJUGATE_GRADIENT_STEPS = 80
-COLOR_ROUNDS = 3
-"""Alternations between the points' first colors and the pixels that hide them."""
-MOST_SHOWN = 1 / 3
-"""Share of the scene up to which a pixel counts as hiding it in these."""
 PRIOR_SCALE = 0.05
 """Difference of T or B up to which the sparse prior takes a pixel for as expected."""
 SMOOTHNESS_FLOOR = 0.01
 """Difference of layers between neighboring working pixels that is expected even where photos are uniform."""
+CHANGE_RATIO = 2.0
+"""Differences of layers that are expected, over those of the photos' mean and of their relative deviation. In these an
+edge is lessened: in the mean by the contrast of artifact and scene."""
 OUTLIER_SCALE = 2.385
 """Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden. With
 this scale the estimate has 95 % of least squares' efficiency under Gaussian noise."""
@@ -45,9 +45,9 @@ clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What is found
 on less may be an error of the layers."""
-
-_LEAST_WEIGHT = 1e-3
-"""Of a sample that is left out of a median: a point that has no others keeps a color."""
+LIGHT_SHARE = 1 / 3
+"""Share of an artifact's light that nothing white could have in its place, from which on it adds light. Errors of T
+pass for the rest."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class LayerEstimate:
         """Whether the artifact adds light and hides nothing.
 
         What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
-        that is the greater part of the light of details, which a film of errors has not, and more than noise beside
+        that is LIGHT_SHARE of the light of details, which a film of errors has not, and more than noise beside
         all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. All by squares,
         where there is more than noise.
         """
@@ -96,8 +96,8 @@ class LayerEstimate:
         excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)[present]
         details = (added * (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0))[present]
         light = (excess * added[present].square()).sum()
-        mostly = (excess * details).sum() > 0.5 * details.sum()
-        return bool(mostly & (light > MIN_OPACITY * opacity[present].square().sum()))
+        mostly = (excess * details).sum() > LIGHT_SHARE * details.sum()
+        return bool(mostly & (light > MIN_OPACITY**2 * opacity[present].square().sum()))
 
 
 @torch.no_grad()
@@ -126,7 +126,7 @@ def estimate_layers(
     """
     height, width = samples.size
     observed, point, pixel = samples.color, samples.point, samples.pixel
-    colors, residual = _start(samples, mean, deviation, always_hiding)
+    colors, residual = first_colors(samples, mean, deviation, always_hiding)
     across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
     layers = expected = expected_layers(samples, colors[point], mean, deviation, hidden, static)
     prior = torch.ones_like(layers[..., :1])
@@ -178,62 +178,14 @@ def robust_deviation(residuals: Tensor) -> Tensor:
     return 1.48 * residuals.abs().median() + GRAY_LEVEL
 
 
-def _start(
-    samples: PointSamples, mean: Tensor, deviation: Tensor, always_hiding: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """First colors of the points [N, 3], and the residuals of their samples [S, 3].
-
-    A color is the median of the point's samples, each weighed by how much the photos vary at its pixel: what is in
-    front varies little. But a thumb in changing light may vary more than a plain floor. So colors and the pixels that
-    hide them are found by turns, and the samples of these leave the median to the others. A pixel
-    has to hide two thirds of the scene for that, and half of it to start as opaque, because the colors, too, are
-    uncertain where all photos agree.
-
-    Behind what is opaque every sample is an outlier to a clear pixel. Robust weights would then silence all of them,
-    and the prior would take the pixel for clear. So the residuals of a pixel that hides are those of an opaque one.
-    """
-    variance = deviation.flatten().square()
-    relative = (variance / variance.nanmedian().clamp_min(1e-12)).nan_to_num(1.0).clamp_max(1.0)
-    weight = relative[samples.pixel].double() + _LEAST_WEIGHT
-    constant = samples.color - mean.reshape(-1, 3)[samples.pixel]
-    colors = _medians(samples, weight)
-    always = False if always_hiding is None else always_hiding.flatten()[samples.pixel]
-    for _ in range(COLOR_ROUNDS):
-        hiding = always | _hiding(samples, samples.color - colors[samples.point], constant, MOST_SHOWN)
-        colors = _medians(samples, torch.where(hiding, _LEAST_WEIGHT * weight, weight))
-    clear = samples.color - colors[samples.point]
-    hiding = always | _hiding(samples, clear, constant, 0.5)
-    return colors, torch.where(hiding[:, None], constant, clear)
-
-
-def _hiding(samples: PointSamples, clear: Tensor, constant: Tensor, shown: float) -> Tensor:
-    """Whether less than the share `shown` of the scene comes through where a sample is, bool [S].
-
-    What comes through of a scene varies by T |C - mean C|, so differences from the photos' mean, `constant` [S, 3], are
-    T / (1 - T) times those from the points, `clear`, summed over their absolute values around the pixel.
-    """
-    height, width = samples.size
-    excess = (constant.abs() - shown / (1 - shown) * clear.abs()).sum(dim=-1, keepdim=True)
-    around = local_mean(summed(samples.pixel, excess, height * width).reshape(height, width, 1), DETAIL_RADIUS)
-    return around.flatten()[samples.pixel] < 0
-
-
-def _medians(samples: PointSamples, weight: Tensor) -> Tensor:
-    """Weighted median colors [N, 3] of the points, given the samples' weights [S]."""
-    sums = nn.functional.pad(weight.cumsum(0), (1, 0))
-    points = torch.arange(samples.points, device=weight.device)
-    first = torch.searchsorted(samples.point, points)
-    last = torch.searchsorted(samples.point, points, right=True)
-    middle = torch.searchsorted(sums, (sums[first] + sums[last]) / 2) - 1
-    return samples.color[middle.clamp(0, len(samples.color) - 1)]
-
-
 def _smoothness(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
     """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension."""
-    change = mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True).square() + SMOOTHNESS_FLOOR**2
+    change = CHANGE_RATIO * mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True)
+    typical = deviation.nanmedian().clamp_min(GRAY_LEVEL)
     # Where the deviation is unknown, no edge of it is known.
-    relative = (deviation.diff(dim=dimension) / deviation.nanmedian().clamp_min(GRAY_LEVEL)).nan_to_num(0.0)
-    return torch.cat([1 / (change + relative.square()), (1 / change).expand(-1, -1, 3)], dim=-1)
+    relative = CHANGE_RATIO * (deviation.diff(dim=dimension) / typical).nan_to_num(0.0)
+    variance = change.square() + SMOOTHNESS_FLOOR**2
+    return torch.cat([1 / (variance + relative.square()), (1 / variance).expand(-1, -1, 3)], dim=-1)
 
 
 def _solve(sums: Tensor, across: Tensor, down: Tensor, prior: Tensor, expected: Tensor, layers: Tensor) -> Tensor:
