@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from benchmarks.start_accuracy import LAYERS, Command
+from benchmarks.start_accuracy import HELD_OUT, LAYERS, Command
 from ssa_nerfstudio.cli import main
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence import layer_estimate
@@ -21,7 +21,7 @@ def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_sc
     output.write_text(json.dumps(former) + "\n")
     before = layer_estimate.ROUNDS
     for _ in range(2):
-        Command([tmp_path / "covered"], vary=True, output=output).run()
+        Command([tmp_path / "covered"], vary=True, held_out=True, output=output).run()
     assert before == layer_estimate.ROUNDS
     _, *rows = [json.loads(line) for line in output.read_text().splitlines()]
     assert len({(row["constant"], row["factor"]) for row in rows}) == len(rows)
@@ -29,11 +29,15 @@ def test_each_constant_has_a_row_and_nothing_is_measured_twice(write_built_in_sc
     assert as_it_is["constant"] == ""
     assert as_it_is["T_off"] < 0.1 < 0.4 > as_it_is["T_on"], "a dashboard over a third of the frame"
     assert any(row["T_on"] != as_it_is["T_on"] for row in others)
+    assert all(("held_out" in row) == (row["constant"].split(".")[0] in HELD_OUT) for row in rows)
+    predicted = {row["held_out"] for row in rows if row["constant"] == "layer_estimate.PRIOR_SCALE"}
+    assert len(predicted - {as_it_is["held_out"]}) == 2
     assert as_it_is["seeds"] == 0, "a room of walls"
     assert as_it_is["gaps"] > 0, "between its points"
     assert all("gaps" in row for row in others if row["constant"].startswith(("distant_points.", "gap_points.")))
     printed = capsys.readouterr().out
     assert printed.count("| layer_estimate.PRIOR_SCALE |") == 2
+    assert printed.count("verdicts changed | held out |") == 4
     for constant in ("distant_points.SPACING", "gap_points.NEIGHBORS", "scene_photos.MIN_SHOWN"):
         assert printed.count(f"| {constant} | ") == 2
 

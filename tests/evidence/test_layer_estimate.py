@@ -98,6 +98,19 @@ def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, c
     assert layers.adds_light() == adds
 
 
+@pytest.mark.parametrize(("added", "dark", "adds"), [(0.4, 0, True), (0.25, 0, False), (1, 12, True), (1, 28, False)])
+def test_light_is_added_from_a_third_of_the_light_on_and_beside_what_hides_little(
+    added: float, dark: int, adds: bool
+) -> None:
+    """Text that also hides, and a black film above it: squares of 0.72 beside a hundredth of 0, 52 and 121."""
+    text = torch.zeros(HEIGHT, WIDTH, 1)
+    text[30:33, 2:20:3] = 0.2
+    transmittance = 1 - (1 - added) * text
+    transmittance[:dark] = 0.7
+    layers = LayerEstimate(transmittance, text.expand(-1, -1, 3), torch.ones_like(text), torch.zeros_like(text))
+    assert layers.adds_light() == adds
+
+
 def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> None:
     """Half of the points are always behind the disc, where they have its color in every view."""
     transmittance, addition = ARTIFACTS["opaque and soft"]
