@@ -3,7 +3,7 @@
 Of clean datasets it is the error where nothing is in front. `light`: how much of what the scene leaves unexplained a
 light for each photo explains, over the share `hidden` of the frame (`evidence.artifact_light`); `left`: what a second
 estimate leaves of the squares that the first leaves there (`evidence.mean_light`); `held_out`: how far samples lie from
-layers and colors that were estimated without them, as the mean of Cauchy's log(1 + r^2 / s^2), which needs no truth.
+layers and colors that were estimated without their photos, as the mean of Cauchy's log(1 + r^2 / s^2): no truth needed.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ ESTIMATE = {
 HELD_OUT = "", "first_colors", "expected_layers", "layer_estimate"
 """Modules whose constants leave the samples as they are, so that held-out ones can be compared."""
 FOLDS = 5
-"""A sample in so many is held out."""
+"""A photo in so many is held out."""
 SEEDS = {
     "distant_points": ("SPACING", "DISTANCE", "NOISE", "PATCH", "SIGNIFICANCE", "MIN_SIGHTS"),
     "gap_points": ("SPACING", "NEIGHBORS", "FLATNESS", "CLEAR_BY", "MAX_VIEWS"),
@@ -97,7 +97,7 @@ class Command:
     vary: bool = False
     """Also halve and double each constant, of more seeds, too, of which their number is told."""
     held_out: bool = False
-    """Also predict samples that are held out, for constants of the estimate alone."""
+    """Also predict samples of photos that are held out, for constants of the estimate alone."""
     first: bool = False
     """Also measure the first estimate alone, named so as a constant. A second one is made where the light changes."""
     output: Annotated[Path, file_to_write()] | None = None
@@ -241,11 +241,16 @@ def _measure(path: Path, variants: list[tuple[str, float]], held_out: bool) -> I
 
 
 def _distance_of_others(samples: PointSamples, guide: torch.Tensor, detection: Detection) -> Callable[[], float]:
-    """What measures held-out samples by the estimate's constants at the time, in units of the noise by the present."""
+    """What measures held-out samples by the estimate's constants at the time, in units of the noise by the present.
+
+    They are those of whole photos, of points that others show, too. The first estimate predicts them. What all photos
+    say together is of these, too: mean and deviation, the detected area, the falloff.
+    """
     falloff = estimate_falloff(samples)
-    away = (samples.view + samples.point) % FOLDS == 0
+    away = samples.view % FOLDS == 0
     parts = {name: getattr(samples, name)[~away] for name in ("point", "pixel", "color", "view")}
-    kept, those = replace(samples, **parts, patch=None), away.nonzero()[:, 0]
+    kept = replace(samples, **parts, patch=None)
+    those = (away & torch.isin(samples.point, kept.point)).nonzero()[:, 0]
 
     def found() -> LayerEstimate:
         return estimate(kept, guide, detection.opaque, detection.mask, falloff)

@@ -30,8 +30,8 @@ PRIOR_SCALE = 0.05
 SMOOTHNESS_FLOOR = 0.01
 """Difference of layers between neighboring working pixels that is expected even where photos are uniform."""
 CHANGE_RATIO = 2.0
-"""Differences of layers that are expected, over those of the photos' mean and of their relative deviation. In these an
-edge is lessened: in the mean by the contrast of artifact and scene."""
+"""Differences of layers that are expected, over those of the photos' mean and of their relative deviation. An edge of T
+changes the mean by its contrast with the scene alone."""
 OUTLIER_SCALE = 2.385
 """Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden. With
 this scale the estimate has 95 % of least squares' efficiency under Gaussian noise."""
@@ -40,14 +40,14 @@ CLEAR_SHARE = 0.2
 MIN_OPACITY = 2 * PRIOR_SCALE
 """Opacities below this are noise."""
 CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
-"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.2 % of the frame of three
+"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.5 % of the frame of four
 clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What is found
 on less may be an error of the layers."""
 LIGHT_SHARE = 1 / 3
-"""Share of an artifact's light that nothing white could have in its place, from which on it adds light. Errors of T
-pass for the rest."""
+"""Share of an artifact's light from which on it adds light: of what even white in place of the scene would not give. It
+is not all of it, because errors of T make some of it pass for light of what hides."""
 
 
 @dataclass(frozen=True)
@@ -87,9 +87,9 @@ class LayerEstimate:
         """Whether the artifact adds light and hides nothing.
 
         What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
-        that is LIGHT_SHARE of the light of details, which a film of errors has not, and more than noise beside
-        all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. All by squares,
-        where there is more than noise.
+        that is more than LIGHT_SHARE of the light of details, which a film of errors has not, and more than noise
+        beside all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. All by
+        squares, where there is more than noise.
         """
         opacity, added = self.opacity(), self.addition.amax(dim=-1, keepdim=True)
         present = opacity > MIN_OPACITY
@@ -112,7 +112,7 @@ def estimate_layers(
     """Estimate T and B of every pixel.
 
     Minimizes, over T, B and the points' colors C, the robust squares of I - T C - B over all samples, with two priors:
-    neighboring pixels differ about as much as mean and deviation of the photos do there, and most pixels are as
+    neighboring pixels differ about twice as much as mean and deviation of the photos do there, and most pixels are as
     `expected_layers` says (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
 
     Args:

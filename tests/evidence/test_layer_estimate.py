@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.layer_estimate import (
-    CHANGE_RATIO,
     SMOOTHNESS_FLOOR,
     LayerEstimate,
     _smoothness,
@@ -274,8 +273,8 @@ def test_layers_may_differ_between_neighbors_twice_as_much_as_the_photos_do_ther
     assert precision.shape == (3, 3, 4)
     floor = SMOOTHNESS_FLOOR**2
     torch.testing.assert_close(precision[0, 0], torch.full((4,), 1 / floor))
-    torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + 0.25 * CHANGE_RATIO**2)))
-    torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + CHANGE_RATIO**2), *[1 / floor] * 3]))
+    torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + 1)))
+    torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + 4), *[1 / floor] * 3]))
     assert (_smoothness(mean, deviation, 0) == 1 / floor).all()
 
 
