@@ -313,8 +313,11 @@ def _print_sensitivity(
             any(row[key] != before[key] for key in ("verdict", "adds_light"))
             for row, before in zip(rows, plain, strict=True)
         )
-        others = [row["held_out"] for row in rows if "held_out" in row]
-        return f"{on:.3f} | {off:.3f} | {changed}" + ((f" | {np.mean(others):.4f}" if others else " | ") * predicted)
+        cells = [f"{on:.3f}", f"{off:.3f}", str(changed)]
+        if predicted:  # a mean over fewer datasets would not compare
+            others = [row["held_out"] for row in rows if "held_out" in row]
+            cells.append(f"{np.mean(others):.4f}" if len(others) == len(rows) else "")
+        return " | ".join(cells)
 
     predicted = any("held_out" in row for row in known.values())
     columns = "there | elsewhere | verdicts changed" + " | held out" * predicted
