@@ -226,6 +226,10 @@ def test_marks_rise_to_the_last_step(steps, count):
         ("scenes: [{data: a}]\ntradeoff: {scenes: [a], knobs: {steps: []}}", "knobs.steps needs at least one"),
         ("scenes: [{data: a}]\ntradeoff: {scenes: [a], together: [{}]}", "needs at least one knob"),
         ("scenes: [{data: a, modle: {}}]", "unknown key 'modle' in scenes.0. .did you mean 'model'"),
+        (
+            "scenes: [{data: a}]\ncandidates: {wide: {clearance: .inf}}",
+            "a setting of candidate 'wide' must be finite, got clearance: inf",
+        ),
     ],
 )
 def test_a_faulty_file_is_refused_in_one_line(tmp_path, text, culprit):

@@ -5,6 +5,7 @@ All of these raise ValueError where a field is out of its range.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -202,6 +203,9 @@ def _check_names(settings: dict[Any, Any], what: str) -> None:
     for name in settings:
         if not name:
             raise ValueError(f"{what} must have a name, got {name!r}")
+        value = settings[name]
+        if isinstance(value, float) and not math.isfinite(value):  # a result, which states it, is written as JSON
+            raise ValueError(f"{what} must be finite, got {name}: {value}")
 
 
 def _require(names: tuple[str, ...], known: list[str], what: str) -> None:
