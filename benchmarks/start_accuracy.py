@@ -68,7 +68,7 @@ ESTIMATE = {
         "CONJUGATE_GRADIENT_STEPS",
         "PRIOR_SCALE",
         "SMOOTHNESS_FLOOR",
-        "CHANGE_RATIO",
+        "MEAN_CONTRAST",
         "OUTLIER_SCALE",
         "CLEAR_SHARE",
         "LIGHT_SHARE",

@@ -29,9 +29,9 @@ PRIOR_SCALE = 0.05
 """Difference of T or B up to which the sparse prior takes a pixel for as expected."""
 SMOOTHNESS_FLOOR = 0.01
 """Difference of layers between neighboring working pixels that is expected even where photos are uniform."""
-CHANGE_RATIO = 2.0
-"""Differences of layers that are expected, over those of the photos' mean and of their relative deviation. An edge of T
-changes the mean by its contrast with the scene alone."""
+MEAN_CONTRAST = 1 / 3
+"""Contrast of an artifact and the scene behind it, the mean difference of two colors in [0, 1]: an edge of T changes
+the photos' mean by so much of its own height."""
 OUTLIER_SCALE = 2.385
 """Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden. With
 this scale the estimate has 95 % of least squares' efficiency under Gaussian noise."""
@@ -112,8 +112,8 @@ def estimate_layers(
     """Estimate T and B of every pixel.
 
     Minimizes, over T, B and the points' colors C, the robust squares of I - T C - B over all samples, with two priors:
-    neighboring pixels differ about twice as much as mean and deviation of the photos do there, and most pixels are as
-    `expected_layers` says (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
+    neighboring pixels differ as mean and deviation of the photos do there, by more where something hides the scene, and
+    most pixels are as `expected_layers` says (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
 
     Args:
         samples: of the scene's points.
@@ -127,7 +127,7 @@ def estimate_layers(
     height, width = samples.size
     observed, point, pixel = samples.color, samples.point, samples.pixel
     colors, residual = first_colors(samples, mean, deviation, always_hiding)
-    across, down = _smoothness(mean, deviation, 1), _smoothness(mean, deviation, 0)
+    across, down = _photo_differences(mean, deviation, 1), _photo_differences(mean, deviation, 0)
     layers = expected = expected_layers(samples, colors[point], mean, deviation, hidden, static)
     prior = torch.ones_like(layers[..., :1])
     seen_by = torch.bincount(point, minlength=samples.points)[point]
@@ -151,7 +151,9 @@ def estimate_layers(
         sums = summed(pixel, (precision * moments).double(), height * width).reshape(height, width, 9)
         if round_ >= ROUNDS // 2:
             prior = 1 / (PRIOR_SCALE**2 + (layers - expected).square().amax(dim=-1, keepdim=True))
-        layers = _solve(sums, across, down, prior, expected, layers)
+        opacity = smallest_matte(layers[..., :1], layers[..., 1:])
+        smoothness = _smoothness(across, opacity, 1), _smoothness(down, opacity, 0)
+        layers = _solve(sums, *smoothness, prior, expected, layers)
         # What hides more than half is not taken for clear, as behind binoculars.
         clearest = max(1, round((1 - CLEAR_SHARE) * height * width))
         brightest = layers[..., 0].flatten().kthvalue(clearest).values.clamp_min(0.5)
@@ -178,14 +180,25 @@ def robust_deviation(residuals: Tensor) -> Tensor:
     return 1.48 * residuals.abs().median() + GRAY_LEVEL
 
 
-def _smoothness(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
-    """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension."""
-    change = CHANGE_RATIO * mean.diff(dim=dimension).abs().amax(dim=-1, keepdim=True)
+def _photo_differences(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
+    """Squares [h, w, 4] of how T and B are expected to differ between neighbors along a dimension, as the photos do."""
+    change = mean.diff(dim=dimension).square().amax(dim=-1, keepdim=True)
     typical = deviation.nanmedian().clamp_min(GRAY_LEVEL)
     # Where the deviation is unknown, no edge of it is known.
-    relative = CHANGE_RATIO * (deviation.diff(dim=dimension) / typical).nan_to_num(0.0)
-    variance = change.square() + SMOOTHNESS_FLOOR**2
-    return torch.cat([1 / (variance + relative.square()), (1 / variance).expand(-1, -1, 3)], dim=-1)
+    relative = (deviation.diff(dim=dimension) / typical).nan_to_num(0.0).square()
+    return torch.cat([change + relative, change.expand(-1, -1, 3)], dim=-1)
+
+
+def _smoothness(differences: Tensor, opacity: Tensor, dimension: int) -> Tensor:
+    """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension.
+
+    In the clear layers differ no more than the photos do, and where something hides the scene by 1 / MEAN_CONTRAST as
+    much; the opacity [h, w, 1] that is known so far says how much it is of either.
+    """
+    neighbors = opacity.shape[dimension] - 1
+    most = torch.maximum(opacity.narrow(dimension, 0, neighbors), opacity.narrow(dimension, 1, neighbors))
+    ratio = 1 + (1 / MEAN_CONTRAST - 1) * most
+    return 1 / (ratio.square() * differences + SMOOTHNESS_FLOOR**2)
 
 
 def _solve(sums: Tensor, across: Tensor, down: Tensor, prior: Tensor, expected: Tensor, layers: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from torch import Tensor
 from ssa_nerfstudio.evidence.layer_estimate import (
     SMOOTHNESS_FLOOR,
     LayerEstimate,
+    _photo_differences,
     _smoothness,
     estimate_layers,
 )
@@ -264,18 +265,36 @@ def test_any_number_of_samples_gives_finite_layers(seed: int) -> None:
             assert layer.max() <= 1
 
 
-def test_layers_may_differ_between_neighbors_twice_as_much_as_the_photos_do_there() -> None:
-    """From left to right: nothing differs; the mean does, by half of white in one channel; the deviation doubles."""
+@pytest.mark.parametrize(("opacity", "ratio"), [(0.0, 1.0), (0.5, 2.0), (1.0, 3.0)])
+def test_neighboring_layers_differ_as_the_photos_do_and_more_where_something_hides(
+    opacity: float, ratio: float
+) -> None:
+    """From left to right: nothing differs; the mean does, by half of white in one channel; the deviation doubles.
+
+    A contrast of a third makes an edge of T three times as high as that of the mean.
+    """
     mean, deviation = torch.full((3, 4, 3), 0.2), torch.full((3, 4, 1), 0.1)
     mean[:, 2:, 1] = 0.7
     deviation[:, 3:] = 0.2
-    precision = _smoothness(mean, deviation, 1)
+    there = torch.full((3, 4, 1), opacity)
+    precision = _smoothness(_photo_differences(mean, deviation, 1), there, 1)
     assert precision.shape == (3, 3, 4)
     floor = SMOOTHNESS_FLOOR**2
     torch.testing.assert_close(precision[0, 0], torch.full((4,), 1 / floor))
-    torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + 1)))
-    torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + 4), *[1 / floor] * 3]))
-    assert (_smoothness(mean, deviation, 0) == 1 / floor).all()
+    torch.testing.assert_close(precision[1, 1], torch.full((4,), 1 / (floor + (ratio * 0.5) ** 2)))
+    torch.testing.assert_close(precision[2, 2], torch.tensor([1 / (floor + ratio**2), *[1 / floor] * 3]))
+    assert (_smoothness(_photo_differences(mean, deviation, 0), there, 0) == 1 / floor).all()
+
+
+def test_an_edge_of_an_artifact_may_be_as_high_as_its_opaque_side_allows() -> None:
+    mean, deviation = torch.full((1, 3, 3), 0.2), torch.full((1, 3, 1), 0.1)
+    mean[:, 1:] = 0.7
+    side = torch.tensor([0.0, 1.0, 0.0])[None, :, None]
+    left, right = _smoothness(_photo_differences(mean, deviation, 1), side, 1)[0, :, 1]
+    torch.testing.assert_close(left, torch.tensor(1 / (SMOOTHNESS_FLOOR**2 + 1.5**2)))
+    assert right == 1 / SMOOTHNESS_FLOOR**2
+    mirrored = _smoothness(_photo_differences(mean, deviation, 1), 1 - side, 1)
+    assert torch.equal(mirrored[0, 0, 1], left), "either neighbor may be the opaque one"
 
 
 def test_pixels_that_masks_hide_do_not_change_the_smoothness_of_others() -> None:
@@ -284,8 +303,8 @@ def test_pixels_that_masks_hide_do_not_change_the_smoothness_of_others() -> None
     deviation[:, 3:] = 0.2
     masked = deviation.clone()
     masked[3:] = torch.nan
-    assert torch.equal(_smoothness(mean, masked, 1)[:3], _smoothness(mean, deviation, 1)[:3])
-    assert torch.isfinite(_smoothness(mean, masked, 0)).all()
+    assert torch.equal(_photo_differences(mean, masked, 1)[:3], _photo_differences(mean, deviation, 1)[:3])
+    assert torch.isfinite(_photo_differences(mean, masked, 0)).all()
 
 
 @pytest.mark.parametrize("masked", [0.0, 0.6])
