@@ -230,6 +230,17 @@ def test_marks_rise_to_the_last_step(steps, count):
             "scenes: [{data: a}]\ncandidates: {wide: {clearance: .inf}}",
             "a setting of candidate 'wide' must be finite, got clearance: inf",
         ),
+        (
+            "scenes: [{data: a}]\ncandidates: {w: {sizes: [1, .nan]}}",
+            "a setting of candidate 'w' must be finite, got sizes",
+        ),
+        (
+            "scenes: [{data: a}]\nmodel: {clearance: -.inf}",
+            "a setting of the model must be finite, got clearance: -inf",
+        ),
+        ("scenes: [{data: a, model: {clearance: .nan}}]", "a setting of the model must be finite, got clearance: nan"),
+        ("scenes: [{data: a}]\ntradeoff: {scenes: [a], knobs: {clearance: [.inf]}}", "a knob must be finite"),
+        ("scenes: [{data: a}]\ntradeoff: {scenes: [a], base: {clearance: .nan}}", "a knob must be finite"),
     ],
 )
 def test_a_faulty_file_is_refused_in_one_line(tmp_path, text, culprit):

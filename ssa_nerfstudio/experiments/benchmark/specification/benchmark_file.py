@@ -5,7 +5,7 @@ All of these raise ValueError where a field is out of its range.
 
 from __future__ import annotations
 
-import math
+import json
 import re
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -157,14 +157,14 @@ class Benchmark:
         if not names or len(set(names)) < len(names):
             raise ValueError(f"scenes need names of their own, and at least one is needed; got {names}")
         for settings in (self.model, *(scene.model for scene in self.scenes)):
-            _check_names(settings, "a setting of the model")
+            _check_settings(settings, "a setting of the model")
         known = [*METHODS, *self.candidates]
         for name in self.candidates:
             if name in METHODS:
                 raise ValueError(f"candidate {name!r} has the name of a method; choose another")
-            _check_names(self.candidates[name], f"a setting of candidate {name!r}")
+            _check_settings(self.candidates[name], f"a setting of candidate {name!r}")
             _require((self.candidates[name].get("method", "default"),), [*METHODS], "method")
-        _check_names(self.candidates, "a candidate")
+        _check_settings(self.candidates, "a candidate")
         for part in self.parts:
             _require(part.methods, known, "method")
             _require(part.scenes or (), names, "scene")
@@ -189,7 +189,7 @@ def read_benchmark(name: str) -> Benchmark:
 
 def _check_knobs(settings: dict[Any, Any]) -> None:
     """Knobs that are no setting of the model, which checks its own."""
-    _check_names(settings, "a knob")
+    _check_settings(settings, "a knob")
     steps, scale = settings.get("steps", 1), settings.get("image_scale", 1.0)
     if not isinstance(steps, int) or isinstance(steps, bool) or steps < 1:
         raise ValueError(f"steps must be whole numbers from 1 on, got {steps!r}")
@@ -199,13 +199,14 @@ def _check_knobs(settings: dict[Any, Any]) -> None:
         raise ValueError(f"densification must be adc or mcmc, got {settings['densification']!r}")
 
 
-def _check_names(settings: dict[Any, Any], what: str) -> None:
+def _check_settings(settings: dict[Any, Any], what: str) -> None:
     for name in settings:
         if not name:
             raise ValueError(f"{what} must have a name, got {name!r}")
-        value = settings[name]
-        if isinstance(value, float) and not math.isfinite(value):  # a result, which states it, is written as JSON
-            raise ValueError(f"{what} must be finite, got {name}: {value}")
+        try:
+            json.dumps(settings[name], default=str, allow_nan=False)  # as a result states it
+        except ValueError as error:
+            raise ValueError(f"{what} must be finite, got {name}: {settings[name]}") from error
 
 
 def _require(names: tuple[str, ...], known: list[str], what: str) -> None:
