@@ -39,7 +39,21 @@ class Areas(NamedTuple):
     seen: Tensor
     """Along rays: of the Gaussian's largest density on the ray of each pixel."""
     drawn: Tensor
-    """By gsplat's projection."""
+    """By gsplat's projection, also beyond the three standard deviations at which it ends a splat."""
+
+
+def beside(places: Tensor, depths: Tensor, scales: Tensor, count: int) -> Tensor:
+    """Indices of at most so many Gaussians in front of a camera and outside its frame, those that look largest first.
+
+    Args:
+        places: of the centers in the frame, [N, 2], from 0 to 1.
+        depths: of the centers, [N]; up to 0 it is behind the camera.
+        scales: largest standard deviations [N], as depths in world units.
+    """
+    outside = ((places < 0) | (places > 1)).any(dim=-1) & (depths > 0)
+    those = outside.nonzero()[:, 0]
+    order = (scales[those] / depths[those]).argsort(descending=True)
+    return those[order[:count]]
 
 
 def areas(gaussians: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int) -> Areas:
@@ -115,9 +129,9 @@ class Command:
         viewmat, K = view_matrix(camera.camera_to_worlds)[0], intrinsics(camera, 1)[0]
         centers = learned["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]
         places = (centers[:, :2] / centers[:, 2:] * K.diagonal()[:2] + K[:2, 2]) / torch.tensor([width, height]).to(K)
-        beside = ((places < 0) | (places > 1)).any(dim=-1) & (centers[:, 2] > float(model.near_plane))
-        reach = torch.exp(learned["scales"]).amax(dim=-1) / centers[:, 2] * beside
-        largest = reach.topk(min(len(reach), 20 * CANDIDATES)).indices
+        scales = torch.exp(learned["scales"]).amax(dim=-1)
+        drawn = centers[:, 2] > model.near_plane
+        largest = beside(places, centers[:, 2] * drawn, scales, 20 * CANDIDATES)
         shown = activated({name: values[largest] for name, values in learned.items()}, with_harmonics=False)
         covered = areas(shown, viewmat, K, width, height)
         most = covered.drawn.topk(min(len(largest), CANDIDATES)).indices
@@ -126,6 +140,9 @@ class Command:
             kept = everything.clone()
             kept[each] = False
             gains.append(quality(chosen, kept) - before[chosen])
+        if not gains:
+            print("no Gaussian beside the frame is drawn")
+            return
         self._print(gains, most, largest, places, centers[:, 2], shown, covered)
 
     def _print(
