@@ -73,6 +73,7 @@ ESTIMATE = {
         "CLEAR_SHARE",
         "LIGHT_SHARE",
     ),
+    "initialization": ("CERTAIN_SHARE",),
     "guided_upsampling": ("RADIUS",),
 }
 """Those of the modules that estimate the layers."""
@@ -227,7 +228,7 @@ def _measure(path: Path, variants: list[tuple[str, float]], held_out: bool) -> I
             "B_on": _mean(size[covered][:, 1:]),
             "T_off": _mean(size[~covered][:, 0]),
             "B_off": _mean(size[~covered][:, 1:]),
-            "adds_light": found.adds_light(),
+            "adds_light": bool(overlay.adds_light),
             "light": round(shading.explained, 3),
             "hidden": round(shading.hidden, 3),
             "noise": round(float(found.noise), 4),

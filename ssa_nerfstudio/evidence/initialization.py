@@ -24,6 +24,9 @@ from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 STATISTICS_SCALE = 0.05
 """s of the paper: a standard deviation of s over the views gives an initial matte of 1 / e."""
+CERTAIN_SHARE = 0.05
+"""Share of a connected area that has to be above CERTAIN_OPACITY: of a film that errors make, a few pixels are. A soft
+spot, whose opacity falls like a Gaussian, has such a share from a peak of 0.32 on."""
 
 
 @torch.no_grad()
@@ -162,8 +165,8 @@ def _present(opacity: Tensor, static: Tensor | None, reduction: int) -> Tensor:
     """Where the estimated opacity [h, w, 1] is more than noise: 1, elsewhere 0, likewise.
 
     Opacities below MIN_OPACITY are noise. A connected area of others may be, too: errors of the points' places and
-    colors make a film of what is hard to see. It counts if somewhere in it there is more than CERTAIN_OPACITY, or a
-    static edge.
+    colors make a film of what is hard to see. It counts if more than CERTAIN_SHARE of it is above CERTAIN_OPACITY, or
+    if it holds a static edge.
 
     Args:
         opacity: at the working resolution.
@@ -171,11 +174,10 @@ def _present(opacity: Tensor, static: Tensor | None, reduction: int) -> Tensor:
         reduction: photo pixels a working pixel.
     """
     area = connected_parts(opacity[..., 0] > MIN_OPACITY)[..., None]
-    sure = opacity > CERTAIN_OPACITY
-    if static is not None:
-        sure |= reduced(static.to(opacity)[..., None], reduction) > 0
-    kept = opacity.new_zeros(int(area.max()) + 1)
-    kept[area[sure]] = 1
+    edge = torch.zeros_like(opacity) if static is None else reduced(static.to(opacity)[..., None], reduction) > 0
+    values = torch.stack([torch.ones_like(opacity), opacity > CERTAIN_OPACITY, edge], dim=-1).reshape(-1, 3)
+    pixels, certain, edges = summed(area.flatten(), values, int(area.max()) + 1).unbind(-1)
+    kept = ((certain > CERTAIN_SHARE * pixels) | (edges > 0)).to(opacity)
     kept[0] = 0
     # A pixel wider, for the soft rim.
     return nn.functional.max_pool2d(kept[area].permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)

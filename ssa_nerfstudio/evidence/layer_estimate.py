@@ -30,8 +30,8 @@ PRIOR_SCALE = 0.05
 SMOOTHNESS_FLOOR = 0.01
 """Difference of layers between neighboring working pixels that is expected even where photos are uniform."""
 MEAN_CONTRAST = 1 / 3
-"""Contrast of an artifact and the scene behind it, the mean difference of two colors in [0, 1]: an edge of T changes
-the photos' mean by so much of its own height."""
+"""Contrast of an artifact and the scene behind it, the mean difference of two gray levels in [0, 1]: an edge of T
+changes the photos' mean by so much of its own height."""
 OUTLIER_SCALE = 2.385
 """Residuals beyond so many standard deviations lose their weight (Cauchy): reflections, points that are hidden. With
 this scale the estimate has 95 % of least squares' efficiency under Gaussian noise."""
@@ -40,7 +40,7 @@ CLEAR_SHARE = 0.2
 MIN_OPACITY = 2 * PRIOR_SCALE
 """Opacities below this are noise."""
 CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
-"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.5 % of the frame of four
+"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.1 % of the frame of four
 clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What is found
@@ -112,8 +112,8 @@ def estimate_layers(
     """Estimate T and B of every pixel.
 
     Minimizes, over T, B and the points' colors C, the robust squares of I - T C - B over all samples, with two priors:
-    neighboring pixels differ as mean and deviation of the photos do there, by more where something hides the scene, and
-    most pixels are as `expected_layers` says (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
+    neighboring pixels differ as mean and deviation of the photos do there, by more where an artifact is, and most
+    pixels are as `expected_layers` says (Cauchy, so that a pixel whose samples say otherwise is not drawn back).
 
     Args:
         samples: of the scene's points.
@@ -181,7 +181,11 @@ def robust_deviation(residuals: Tensor) -> Tensor:
 
 
 def _photo_differences(mean: Tensor, deviation: Tensor, dimension: int) -> Tensor:
-    """Squares [h, w, 4] of how T and B are expected to differ between neighbors along a dimension, as the photos do."""
+    """Squares of the differences of T and B that the photos suggest between neighbors along a dimension.
+
+    Returns:
+        [h, w - 1, 4] or [h - 1, w, 4].
+    """
     change = mean.diff(dim=dimension).square().amax(dim=-1, keepdim=True)
     typical = deviation.nanmedian().clamp_min(GRAY_LEVEL)
     # Where the deviation is unknown, no edge of it is known.
@@ -190,10 +194,15 @@ def _photo_differences(mean: Tensor, deviation: Tensor, dimension: int) -> Tenso
 
 
 def _smoothness(differences: Tensor, opacity: Tensor, dimension: int) -> Tensor:
-    """Inverse variances [h, w, 4] of the differences of T and B between neighbors along a dimension.
+    """Inverse variances of the differences of T and B between neighbors along a dimension.
 
-    In the clear layers differ no more than the photos do, and where something hides the scene by 1 / MEAN_CONTRAST as
-    much; the opacity [h, w, 1] that is known so far says how much it is of either.
+    In the clear they differ no more than the photos do, where the opacity is 1 by 1 / MEAN_CONTRAST times as much, and
+    between in proportion.
+
+    Args:
+        differences: see `_photo_differences`; the result has their shape.
+        opacity: estimated so far, [h, w, 1] in [0, 1]; of the two neighbors the larger one counts.
+        dimension: 0 or 1.
     """
     neighbors = opacity.shape[dimension] - 1
     most = torch.maximum(opacity.narrow(dimension, 0, neighbors), opacity.narrow(dimension, 1, neighbors))

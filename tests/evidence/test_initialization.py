@@ -185,6 +185,17 @@ def test_a_weak_film_counts_only_around_what_is_certain(core: float, edge: bool,
     assert overlay.matte()[:, :20].min() > 0.89
 
 
+@pytest.mark.parametrize(("certain", "kept"), [(4, False), (5, True)])
+def test_a_film_of_which_a_twentieth_is_certain_does_not_count(certain: int, kept: bool) -> None:
+    """A film of 80 pixels: errors reach more than 0.3 in a few of them, too."""
+    layers = estimated(12, 40, 0.1, (0.3, 0.1, 0.1))
+    layers.transmittance[2:10, 26:36], layers.addition[2:10, 26:36] = 0.8, 0.02
+    layers.transmittance[4, 28 : 28 + certain], layers.addition[4, 28 : 28 + certain] = 0.6, 0.04
+    overlay = ScreenSpaceOverlay(12, 40)
+    initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
+    assert (overlay.matte()[2:10, 26:36].min() > 0.19) == kept
+
+
 def test_additive_light_starts_without_a_matte() -> None:
     _, statistics = capture(12, 16)
     overlay = ScreenSpaceOverlay(12, 16, adds_light=True)

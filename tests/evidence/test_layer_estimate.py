@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.evidence import layer_estimate
 from ssa_nerfstudio.evidence.layer_estimate import (
     SMOOTHNESS_FLOOR,
     LayerEstimate,
@@ -295,6 +296,36 @@ def test_an_edge_of_an_artifact_may_be_as_high_as_its_opaque_side_allows() -> No
     assert right == 1 / SMOOTHNESS_FLOOR**2
     mirrored = _smoothness(_photo_differences(mean, deviation, 1), 1 - side, 1)
     assert torch.equal(mirrored[0, 0, 1], left), "either neighbor may be the opaque one"
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_layers_are_sharper_on_an_artifact_than_in_the_clear(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """Gray strokes of little contrast in front of a textured scene that few photos show.
+
+    If layers may nowhere differ by more than the photos, the strokes are smoothed away; if they may everywhere, noise
+    in the clear stays.
+    """
+    transmittance, addition = film(0.9 * hatching(), (0.35, 0.35, 0.35))
+    samples, mean, deviation = observe(transmittance, addition, views=20, points=300, seed=seed)
+    texture = torch.rand(HEIGHT, WIDTH, 1, generator=torch.Generator().manual_seed(5))
+    mean += 0.2 * texture * transmittance
+
+    def errors() -> tuple[float, float]:
+        found = estimate_layers(samples, mean, deviation, NOWHERE, NOWHERE)
+        error, present = (found.transmittance - transmittance).abs(), transmittance < 0.9
+        return float(error[present].mean()), float(error[~present].mean())
+
+    def errors_with(opacity: float) -> tuple[float, float]:
+        def everywhere(differences: Tensor, known: Tensor, dimension: int) -> Tensor:
+            return _smoothness(differences, torch.full_like(known, opacity), dimension)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(layer_estimate, "_smoothness", everywhere)
+            return errors()
+
+    there, clear = errors()
+    assert there < 0.75 * errors_with(0.0)[0]
+    assert clear < 0.75 * errors_with(1.0)[1]
 
 
 def test_pixels_that_masks_hide_do_not_change_the_smoothness_of_others() -> None:
