@@ -40,7 +40,7 @@ CLEAR_SHARE = 0.2
 MIN_OPACITY = 2 * PRIOR_SCALE
 """Opacities below this are noise."""
 CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
-"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.1 % of the frame of four
+"""Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.0 % of the frame of four
 clean captures."""
 MIN_SHARE = 0.02
 """Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What is found

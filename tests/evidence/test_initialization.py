@@ -186,7 +186,7 @@ def test_a_weak_film_counts_only_around_what_is_certain(core: float, edge: bool,
 
 
 @pytest.mark.parametrize(("certain", "kept"), [(4, False), (5, True)])
-def test_a_film_of_which_a_twentieth_is_certain_does_not_count(certain: int, kept: bool) -> None:
+def test_a_film_counts_only_if_more_than_a_twentieth_of_it_is_certain(certain: int, kept: bool) -> None:
     """A film of 80 pixels: errors reach more than 0.3 in a few of them, too."""
     layers = estimated(12, 40, 0.1, (0.3, 0.1, 0.1))
     layers.transmittance[2:10, 26:36], layers.addition[2:10, 26:36] = 0.8, 0.02
@@ -194,6 +194,26 @@ def test_a_film_of_which_a_twentieth_is_certain_does_not_count(certain: int, kep
     overlay = ScreenSpaceOverlay(12, 40)
     initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
     assert (overlay.matte()[2:10, 26:36].min() > 0.19) == kept
+
+
+def test_a_rim_that_would_be_noise_by_itself_is_kept_for_a_pixel() -> None:
+    layers = estimated(12, 40, 0.1, (0.3, 0.1, 0.1))
+    layers.transmittance[:, 26:32], layers.transmittance[:, 32:35] = 0.5, 0.92
+    overlay = ScreenSpaceOverlay(12, 40)
+    initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
+    matte = overlay.matte()[6, :, 0]
+    assert matte[31] > 0.4
+    assert 0.05 < matte[32] < 0.3
+    assert matte[34] < 0.011
+
+
+def test_what_hides_without_adding_light_starts_clear_in_additive_light() -> None:
+    """It hides nothing, so errors of T are no reason to take weak light for more than noise."""
+    layers = estimated(12, 40, 0.1, (0.3, 0.1, 0.1))
+    layers.transmittance[:, 26:36], layers.addition[:, 26:36] = 0.4, 0.08
+    overlay = ScreenSpaceOverlay(12, 40, adds_light=True)
+    initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
+    assert overlay.layers()[1][:, 27:35].max() < 0.02
 
 
 def test_additive_light_starts_without_a_matte() -> None:

@@ -328,6 +328,21 @@ def test_layers_are_sharper_on_an_artifact_than_in_the_clear(monkeypatch: pytest
     assert clear < 0.75 * errors_with(1.0)[1]
 
 
+def test_light_counts_as_an_artifact_to_the_smoothness(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = []
+
+    def recorded(differences: Tensor, opacity: Tensor, dimension: int) -> Tensor:
+        known.append(opacity)
+        return _smoothness(differences, opacity, dimension)
+
+    monkeypatch.setattr(layer_estimate, "_smoothness", recorded)
+    estimate_layers(*observe(*ARTIFACTS["additive"]), NOWHERE, NOWHERE)
+    strokes = hatching() > 0
+    assert known[0].max() == 0, "nothing is known in the first turn"
+    assert known[-1][strokes].mean() > 0.3
+    assert known[-1][~strokes].mean() < 0.1
+
+
 def test_pixels_that_masks_hide_do_not_change_the_smoothness_of_others() -> None:
     """Most of the frame is masked in all photos, so its deviation is unknown."""
     mean, deviation = torch.full((9, 4, 3), 0.2), torch.full((9, 4, 1), 0.1)
