@@ -7,7 +7,6 @@ One row for each of those that change a view's error most when they are left out
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -130,43 +129,27 @@ class Command:
         centers = learned["means"] @ viewmat[:3, :3].T + viewmat[:3, 3]
         places = (centers[:, :2] / centers[:, 2:] * K.diagonal()[:2] + K[:2, 2]) / torch.tensor([width, height]).to(K)
         scales = torch.exp(learned["scales"]).amax(dim=-1)
-        drawn = centers[:, 2] > model.near_plane
-        largest = beside(places, centers[:, 2] * drawn, scales, 20 * CANDIDATES)
-        shown = activated({name: values[largest] for name, values in learned.items()}, with_harmonics=False)
-        covered = areas(shown, viewmat, K, width, height)
-        most = covered.drawn.topk(min(len(largest), CANDIDATES)).indices
-        gains = []
-        for each in largest[most]:
-            kept = everything.clone()
-            kept[each] = False
-            gains.append(quality(chosen, kept) - before[chosen])
-        if not gains:
+        depths = torch.where(centers[:, 2] > model.near_plane, centers[:, 2], 0.0)  # nearer ones are not drawn
+        largest = beside(places, depths, scales, 20 * CANDIDATES)
+        if not len(largest):
             print("no Gaussian beside the frame is drawn")
             return
-        self._print(gains, most, largest, places, centers[:, 2], shown, covered)
-
-    def _print(
-        self,
-        gains: Sequence[float],
-        most: Tensor,
-        largest: Tensor,
-        places: Tensor,
-        depths: Tensor,
-        shown: Gaussians,
-        covered: Areas,
-    ) -> None:
+        shown = activated({name: values[largest] for name, values in learned.items()}, with_harmonics=False)
+        covered = areas(shown, viewmat, K, width, height)
+        rows = []
+        for i in covered.drawn.topk(min(len(largest), CANDIDATES)).indices.tolist():
+            kept = everything.clone()
+            kept[largest[i]] = False
+            gain = quality(chosen, kept) - before[chosen]
+            place, depth = places[largest[i]].tolist(), depths[largest[i]].item()
+            size, opacity = shown.scales[i].max().item(), shown.opacities[i].item()
+            seen, drawn = covered.seen[i].item(), covered.drawn[i].item()
+            rows.append((*place, depth, size, opacity, seen, drawn, drawn / max(seen, 1.0), gain))
         print("| center (frame: 0 to 1) | depth | largest sigma | opacity | seen | drawn | ratio | without it, dB |")
         print("|---|---|---|---|---|---|---|---|")
-        order = sorted(range(len(gains)), key=lambda number: -abs(gains[number]))
-        for number in order[: self.rows]:
-            i = int(most[number])
-            (x, y), depth = places[largest[i]].tolist(), float(depths[largest[i]])
-            seen, drawn = float(covered.seen[i]), float(covered.drawn[i])
-            size, opacity = float(shown.scales[i].max()), float(shown.opacities[i])
-            print(
-                f"| {x:.2f}, {y:.2f} | {depth:.2f} | {size:.2f} | {opacity:.2f} | {seen:.0f} | {drawn:.0f} "
-                f"| {drawn / max(seen, 1.0):.1f} | {gains[number]:+.2f} |"
-            )
+        row = "| {:.2f}, {:.2f} | {:.2f} | {:.2f} | {:.2f} | {:.0f} | {:.0f} | {:.1f} | {:+.2f} |"
+        for values in sorted(rows, key=lambda values: -abs(values[-1]))[: self.rows]:
+            print(row.format(*values))
 
 
 @torch.no_grad()
