@@ -1,7 +1,7 @@
 """What a backdrop does for the clean render, by where it is: `python benchmarks/backdrop_accuracy.py --data DIR`
 
 The backdrop comes after the last step, so that one training can be rendered without it and with others: where less of
-the scene is left than each of several transmittances (`scene_photos.MAX_HIDDEN`), by the layers that were learned.
+the scene is left than each of several transmittances (`scene_photos.HIDDEN_BELOW`), by the layers that were learned.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _backdrop(pipeline: SSAPipeline, limit: float) -> Seeds:
     from ssa_nerfstudio.plugin.extra_seeds import photos_of_scene, seeds_between
 
     model, manager = pipeline.model, pipeline.datamanager
-    with patch.object(scene_photos, "MAX_HIDDEN", limit):
+    with patch.object(scene_photos, "HIDDEN_BELOW", limit):
         photos = photos_of_scene(model.artifacts, manager.cached_train, manager.train_dataset.cameras, model.exposure)
     points = manager.train_dataparser_outputs.metadata["points3D_xyz"].to(photos[0].color)
     return seeds_between(points, photos).backdrop

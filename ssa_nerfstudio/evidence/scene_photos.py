@@ -11,13 +11,12 @@ from torch import Tensor, nn
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
 from ssa_nerfstudio.evidence.point_samples import View, project, working_pixels, working_reduction
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
+from ssa_nerfstudio.overlay.layer import HIDDEN_BELOW
 
 MAX_VIEWS = 128
 """Views that are read; of more a regular subset, group by group."""
 MIN_SHOWN = 0.5
 """Transmittance of the artifact below which a pixel does not count."""
-MAX_HIDDEN = 0.1
-"""Transmittance below which a pixel says next to nothing of the scene: what it says is in proportion to the square."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +104,7 @@ def _scene_photo(view: View, group: int, layers: tuple[Tensor, Tensor] | None, a
     if layers is not None:
         transmittance, addition = layers
         shown &= transmittance >= MIN_SHOWN
-        hidden |= transmittance < MAX_HIDDEN
+        hidden |= transmittance < HIDDEN_BELOW
         color = color - (gain if artifact_is_exposed else 1.0) * addition
         color = color / transmittance.clamp_min(MIN_SHOWN)
     return ScenePhoto(view, group, (color / gain).clamp(0, 1), shown, hidden, reduction)

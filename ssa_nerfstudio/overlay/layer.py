@@ -26,6 +26,8 @@ scene behind an opaque pixel loses all gradient. 0.999 is 255 in 8 bits, and gsp
 oracle overlay has no such range."""
 COLOR_LOGIT_RANGE = (-12.0, 12.0)
 """Range of the learned color's logits: 6e-6 to 1 - 6e-6, for the same reason."""
+HIDDEN_BELOW = 0.1
+"""Transmittance below which photos say next to nothing of the scene: what they say is in proportion to its square."""
 OPTIONAL_BUFFERS = ("falloff", "reliable", "noise")
 """Buffers of an overlay that have one pixel of value 1 where nothing is known of them, as in earlier checkpoints."""
 
@@ -146,7 +148,9 @@ class ScreenSpaceOverlay(nn.Module):
             clean: C [H // reduction, W // reduction, 3], the render with its background.
             reduction: 1, 2, 4 or 8: factor by which training images are reduced.
             behind: opacity of the splats [H // reduction, W // reduction, 1] and color of the background [3], for the
-                matte's gradient of `composite_over_splats`; None for plain compositing.
+                matte's gradient of `composite_over_splats`, but for pixels of which the initialization says that they
+                hide the scene (`evidence` below HIDDEN_BELOW): hiding background is what they do. None for plain
+                compositing.
             light: a factor of B, of the render's shape; None for 1.
 
         Returns:
@@ -154,6 +158,9 @@ class ScreenSpaceOverlay(nn.Module):
         """
         if self.reliable.numel() > 1 and clean.requires_grad:
             clean = torch.lerp(clean.detach(), clean, self._at_training_scale(self.reliable, reduction))
+        if behind is not None:
+            known = self._at_training_scale(self.evidence, reduction) < HIDDEN_BELOW
+            behind = torch.where(known, 1.0, behind[0]), behind[1]
         if self.resolution == reduction == 1 and not self.adds_light and light is None:
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         else:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import torch
 
 from ssa_nerfstudio.evidence.point_samples import View
-from ssa_nerfstudio.evidence.scene_photos import MAX_HIDDEN, MAX_VIEWS, MIN_SHOWN, scene_photos
+from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS, MIN_SHOWN, scene_photos
+from ssa_nerfstudio.overlay.layer import HIDDEN_BELOW
 
 HEIGHT, WIDTH = 12, 16
 
@@ -41,8 +42,8 @@ def test_the_scene_is_what_is_left_of_the_artifact_that_a_view_has() -> None:
 
 
 def test_between_shown_and_hidden_a_film_leaves_something_of_the_scene() -> None:
-    T = torch.full((HEIGHT, WIDTH, 1), 1.1 * MAX_HIDDEN)
-    T[:, : WIDTH // 2] = 0.9 * MAX_HIDDEN
+    T = torch.full((HEIGHT, WIDTH, 1), 1.1 * HIDDEN_BELOW)
+    T[:, : WIDTH // 2] = 0.9 * HIDDEN_BELOW
     mask = torch.ones(HEIGHT, WIDTH)
     mask[0] = 0
     # Transmittances may differ between the colors.

@@ -1,4 +1,4 @@
-"""Compositing over splats: the matte has no gradient towards hiding background."""
+"""Compositing over splats: the matte has no gradient towards hiding background where no artifact was found."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import torch
 
 from ssa_nerfstudio.overlay.compositing import composite, composite_logits, composite_over_splats
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 
 
 def scene(accumulation: float) -> tuple[ScreenSpaceOverlay, torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -139,3 +140,52 @@ def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, ove
         found.append((shown.detach(), overlay.color_logits.grad, overlay.alpha_logits.grad))
     for mine, expected in zip(*found, strict=True):
         torch.testing.assert_close(mine, expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("adds_light", [False, True])
+@pytest.mark.parametrize("resolution", [1, 2])
+@pytest.mark.parametrize("reduction", [1, 2])
+def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light, resolution, reduction):
+    """Elsewhere it is the one over splats; scene and color get the plain one everywhere."""
+    generator = torch.Generator().manual_seed(2)
+    overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
+    with torch.no_grad():
+        for parameter in overlay.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64).requires_grad_()
+    behind = (torch.rand(*clean.shape[:2], 1, generator=generator).double(), torch.tensor([0.2, 0.5, 0.9]).double())
+    seen = torch.rand(clean.shape, generator=generator, dtype=torch.float64)
+
+    def gradients(evidence: torch.Tensor | float, over: tuple | None = behind) -> list[torch.Tensor]:
+        overlay.evidence.copy_(torch.as_tensor(evidence))
+        image = overlay.composite(clean, reduction, over)
+        return list(torch.autograd.grad(image, [clean, overlay.color_logits, overlay.alpha_logits], seen))
+
+    plain, over_splats = gradients(1.0, None), gradients(1.0)
+    assert (plain[2] - over_splats[2]).abs().min() > 1e-6
+    some = torch.rand(overlay.evidence.shape, generator=generator) < 0.5
+    everywhere = torch.ones_like(some)
+    # Resampled, a pixel's gradient is that of several pixels.
+    for hidden in (everywhere, ~everywhere, *([some] if resolution == reduction == 1 else [])):
+        *others, found = gradients(torch.where(hidden, 0.05, 0.15))
+        torch.testing.assert_close(found, torch.where(hidden, plain[2], over_splats[2]), rtol=1e-12, atol=1e-14)
+        for ours, theirs in zip(others, plain, strict=False):
+            torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(("opacity", "found", "stays"), [(0.99, 1.0, True), (0.92, 0.92, True), (0.99, 0.0, False)])
+def test_a_known_artifact_stays_opaque_where_no_photo_shows_the_scene(opacity, found, stays):
+    """No splat is behind it, as in a corner that no photo shows. Nothing found: the sparsity takes the overlay away."""
+    generator = torch.Generator().manual_seed(3)
+    overlay, photo = ScreenSpaceOverlay(3, 3), torch.tensor([0.2, 0.3, 0.25]).expand(3, 3, 3)
+    overlay.initialize(photo, torch.full((3, 3, 1), opacity), torch.full((3, 3, 1), 1 - found))
+    optimizer = torch.optim.Adam([overlay.alpha_logits, overlay.color_logits], lr=0.02)
+    for _ in range(600):
+        background = torch.rand(3, generator=generator)
+        shown = overlay.composite(background.expand(3, 3, 3), behind=(torch.zeros(3, 3, 1), background))
+        loss = (shown - photo).abs().mean() + 0.02 * sparsity_loss(overlay.opacity(), overlay.evidence, "log")
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        overlay.clamp_logits()
+    assert (overlay.matte().min() > 0.9) if stays else (overlay.matte().max() < 0.5)
