@@ -27,7 +27,8 @@ oracle overlay has no such range."""
 COLOR_LOGIT_RANGE = (-12.0, 12.0)
 """Range of the learned color's logits: 6e-6 to 1 - 6e-6, for the same reason."""
 HIDDEN_BELOW = 0.1
-"""Transmittance below which photos say next to nothing of the scene: what they say is in proportion to its square."""
+"""Transmittance below which photos say next to nothing of the scene: what they say is in proportion to its square. A
+backdrop is behind such pixels, and their matte may hide background."""
 OPTIONAL_BUFFERS = ("falloff", "reliable", "noise")
 """Buffers of an overlay that have one pixel of value 1 where nothing is known of them, as in earlier checkpoints."""
 
@@ -43,7 +44,8 @@ class ScreenSpaceOverlay(nn.Module):
     """[4] int64: height, width, resolution, adds_light. On loading, a checkpoint gives the overlay's size by it, before
     any photo is opened."""
     evidence: Tensor
-    """r [h, w, 1] in [0, 1]: weight of the sparsity loss, small where the artifact was found."""
+    """r [h, w, 1] in [0, 1], small where the artifact was found: weight of the sparsity loss; below HIDDEN_BELOW the
+    matte's gradient is the plain one (`composite`)."""
     falloff: Tensor
     """F [h, w, 1] in (0, 1] of the lens (`evidence.falloff`); [1, 1, 1] of value 1 for none."""
     reliable: Tensor
@@ -79,7 +81,7 @@ class ScreenSpaceOverlay(nn.Module):
         Args:
             color: W, straight color or additive light, [h, w, 3] in [0, 1].
             alpha: A, [h, w, 1] in [0, 1].
-            evidence: r, [h, w, 1] in [0, 1], weight of the sparsity loss.
+            evidence: r, [h, w, 1] in [0, 1], small where the artifact was found.
         """
         self.color_logits.copy_(color.clamp(*INITIAL_COLOR_RANGE).logit())
         self.alpha_logits.copy_(alpha.clamp(*INITIAL_MATTE_RANGE).logit())
@@ -160,7 +162,7 @@ class ScreenSpaceOverlay(nn.Module):
             clean = torch.lerp(clean.detach(), clean, self._at_training_scale(self.reliable, reduction))
         if behind is not None:
             known = self._at_training_scale(self.evidence, reduction) < HIDDEN_BELOW
-            behind = torch.where(known, 1.0, behind[0]), behind[1]
+            behind = behind[0].masked_fill(known, 1.0), behind[1]
         if self.resolution == reduction == 1 and not self.adds_light and light is None:
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)
         else:

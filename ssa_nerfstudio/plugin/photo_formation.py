@@ -51,7 +51,7 @@ def predicted_photo(
         exposure: of the photos; None where it is not modeled.
         view: the training view; None: the camera is none.
         reduction: factor by which training images are reduced.
-        ignore_background: see `compositing.composite_over_splats`.
+        ignore_background: see `behind` of `ScreenSpaceOverlay.composite`.
         light: factor of B in this photo, [H // reduction, W // reduction, 3]; None: 1.
 
     Returns:

@@ -145,7 +145,8 @@ def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, ove
 @pytest.mark.parametrize("adds_light", [False, True])
 @pytest.mark.parametrize("resolution", [1, 2])
 @pytest.mark.parametrize("reduction", [1, 2])
-def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light, resolution, reduction):
+@pytest.mark.parametrize("in_light", [False, True])
+def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light, resolution, reduction, in_light):
     """Elsewhere it is the one over splats; scene and color get the plain one everywhere."""
     generator = torch.Generator().manual_seed(2)
     overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
@@ -155,10 +156,13 @@ def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light,
     clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64).requires_grad_()
     behind = (torch.rand(*clean.shape[:2], 1, generator=generator).double(), torch.tensor([0.2, 0.5, 0.9]).double())
     seen = torch.rand(clean.shape, generator=generator, dtype=torch.float64)
+    light = 0.5 + torch.rand(clean.shape, generator=generator, dtype=torch.float64) if in_light else None
+    if in_light:
+        overlay.falloff = torch.full((6 // resolution, 8 // resolution, 1), 0.8, dtype=torch.float64)
 
     def gradients(evidence: torch.Tensor | float, over: tuple | None = behind) -> list[torch.Tensor]:
         overlay.evidence.copy_(torch.as_tensor(evidence))
-        image = overlay.composite(clean, reduction, over)
+        image = overlay.composite(clean, reduction, over, light)
         return list(torch.autograd.grad(image, [clean, overlay.color_logits, overlay.alpha_logits], seen))
 
     plain, over_splats = gradients(1.0, None), gradients(1.0)
@@ -167,10 +171,24 @@ def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light,
     everywhere = torch.ones_like(some)
     # Resampled, a pixel's gradient is that of several pixels.
     for hidden in (everywhere, ~everywhere, *([some] if resolution == reduction == 1 else [])):
-        *others, found = gradients(torch.where(hidden, 0.05, 0.15))
+        *others, found = gradients(torch.where(hidden, 0.09, 0.11))
         torch.testing.assert_close(found, torch.where(hidden, plain[2], over_splats[2]), rtol=1e-12, atol=1e-14)
         for ours, theirs in zip(others, plain, strict=False):
             torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize(("evidence", "hidden"), [(0.3, True), (0.4, False)])
+def test_whether_the_scene_is_hidden_is_said_by_the_mean_over_a_pixel_of_the_photo(evidence, hidden):
+    """Three of the four pixels of the overlay that make one of the photo have 0.02: a mean of 0.09 or 0.115."""
+    overlay = ScreenSpaceOverlay(2, 2).double()
+    overlay.evidence.fill_(0.02)
+    overlay.evidence[1, 0] = evidence
+    behind = torch.full((1, 1, 1), 0.3).double(), torch.tensor([0.2, 0.5, 0.9]).double()
+    found = []
+    for over in (behind, None):
+        image = overlay.composite(torch.full((1, 1, 3), 0.7).double(), 2, over)
+        found.append(torch.autograd.grad(image.sum(), overlay.alpha_logits)[0])
+    assert torch.allclose(*found, rtol=1e-12, atol=1e-14) == hidden
 
 
 @pytest.mark.parametrize(("opacity", "found", "stays"), [(0.99, 1.0, True), (0.92, 0.92, True), (0.99, 0.0, False)])
