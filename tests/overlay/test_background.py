@@ -22,6 +22,15 @@ def scene(accumulation: float) -> tuple[ScreenSpaceOverlay, torch.Tensor, torch.
     return overlay, clean, opacity, background
 
 
+def any_overlay(resolution: int, adds_light: bool, generator: torch.Generator) -> ScreenSpaceOverlay:
+    """An overlay of 6 x 8 pixels with random logits."""
+    overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
+    with torch.no_grad():
+        for parameter in overlay.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    return overlay
+
+
 def matte_gradient(accumulation: float, over_splats: bool) -> torch.Tensor:
     """How the error to a photo of the overlay's color changes with the matte."""
     overlay, clean, opacity, background = scene(accumulation)
@@ -121,10 +130,7 @@ def test_composite_logits_has_the_values_and_gradients_of_the_layers(over_splats
 @pytest.mark.parametrize("over_splats", [True, False])
 def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, over_splats):
     generator = torch.Generator().manual_seed(1)
-    overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
-    with torch.no_grad():
-        for parameter in overlay.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    overlay = any_overlay(resolution, adds_light, generator)
     clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64)
     behind = (clean[..., :1], torch.tensor([0.2, 0.5, 0.9], dtype=torch.float64)) if over_splats else None
     found = []
@@ -149,10 +155,7 @@ def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, ove
 def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light, resolution, reduction, in_light):
     """Elsewhere it is the one over splats; scene and color get the plain one everywhere."""
     generator = torch.Generator().manual_seed(2)
-    overlay = ScreenSpaceOverlay(6, 8, resolution, adds_light).double()
-    with torch.no_grad():
-        for parameter in overlay.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator))
+    overlay = any_overlay(resolution, adds_light, generator)
     clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64).requires_grad_()
     behind = (torch.rand(*clean.shape[:2], 1, generator=generator).double(), torch.tensor([0.2, 0.5, 0.9]).double())
     seen = torch.rand(clean.shape, generator=generator, dtype=torch.float64)
