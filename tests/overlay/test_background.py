@@ -101,13 +101,9 @@ def test_splats_and_color_get_the_plain_gradient():
 @pytest.mark.parametrize("over_splats", [True, False])
 def test_composite_logits_has_the_values_and_gradients_of_the_layers(over_splats):
     generator = torch.Generator().manual_seed(0)
-    overlay, _, _, background = scene(0.4)
-    opacity, clean = (torch.rand(4, 5, c, generator=generator, dtype=torch.float64) for c in (1, 3))
-    with torch.no_grad():
-        for parameter in overlay.parameters():
-            parameter.copy_(torch.randn(parameter.shape, generator=generator))
-    target = torch.rand(4, 5, 3, generator=generator, dtype=torch.float64)
-    behind = (opacity, background) if over_splats else None
+    overlay = any_overlay(1, False, generator)
+    opacity, clean, target = (torch.rand(6, 8, c, generator=generator, dtype=torch.float64) for c in (1, 3, 3))
+    behind = (opacity, torch.tensor([0.9, 0.1, 0.1], dtype=torch.float64)) if over_splats else None
     found = []
     for by_hand in (True, False):
         leaf = clean.clone().requires_grad_()
