@@ -149,9 +149,10 @@ def test_an_overlay_composites_its_layers(resolution, reduction, adds_light, ove
 @pytest.mark.parametrize("reduction", [1, 2])
 @pytest.mark.parametrize("in_light", [False, True])
 def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light, resolution, reduction, in_light):
-    """Elsewhere it is the one over splats; scene and color get the plain one everywhere."""
+    """Elsewhere it is the one over splats; scene and color get the plain one everywhere, because no matte is opaque."""
     generator = torch.Generator().manual_seed(2)
     overlay = any_overlay(resolution, adds_light, generator)
+    overlay.alpha_logits.data.clamp_(max=2.0)
     clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64).requires_grad_()
     behind = (torch.rand(*clean.shape[:2], 1, generator=generator).double(), torch.tensor([0.2, 0.5, 0.9]).double())
     seen = torch.rand(clean.shape, generator=generator, dtype=torch.float64)
@@ -174,6 +175,62 @@ def test_the_gradient_is_plain_where_the_scene_is_known_to_be_hidden(adds_light,
         torch.testing.assert_close(found, torch.where(hidden, plain[2], over_splats[2]), rtol=1e-12, atol=1e-14)
         for ours, theirs in zip(others, plain, strict=False):
             torch.testing.assert_close(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("adds_light", [False, True])
+@pytest.mark.parametrize("resolution", [1, 2])
+@pytest.mark.parametrize("reduction", [1, 2])
+@pytest.mark.parametrize("in_light", [False, True])
+def test_the_scene_learns_nothing_where_initialization_and_matte_say_that_it_is_hidden(
+    adds_light, resolution, reduction, in_light
+):
+    """Each quarter of the frame has another answer; the image, the color's and the matte's gradient stay the same."""
+    generator = torch.Generator().manual_seed(4)
+    overlay = any_overlay(resolution, adds_light, generator)
+    matte, evidence = torch.full((6, 8, 1), 0.89), torch.full((6, 8, 1), 0.11)
+    matte[2:], evidence[:, 4:] = 0.91, 0.09
+    each = slice(None, None, resolution)
+    with torch.no_grad():
+        overlay.alpha_logits.copy_(matte[each, each].logit())
+    clean = torch.rand(6 // reduction, 8 // reduction, 3, generator=generator, dtype=torch.float64)
+    behind = torch.ones(*clean.shape[:2], 1, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
+    light = 0.5 + torch.rand(clean.shape, generator=generator, dtype=torch.float64) if in_light else None
+    seen = torch.rand(clean.shape, generator=generator, dtype=torch.float64)
+
+    def result(known: torch.Tensor | float, over: tuple | None = behind) -> list[torch.Tensor]:
+        overlay.evidence.copy_(torch.as_tensor(known))
+        leaf = clean.clone().requires_grad_()
+        image = overlay.composite(leaf, reduction, over, light)
+        wanted = [leaf, overlay.color_logits, overlay.alpha_logits]
+        return [image.detach(), *torch.autograd.grad(image, wanted, seen)]
+
+    free, found = result(1.0), result(evidence[each, each])
+    for index in (0, 2, 3):
+        torch.testing.assert_close(found[index], free[index], rtol=1e-12, atol=1e-14)
+    shown = torch.ones(6, 8, 1, dtype=torch.bool)
+    shown[2:, 4:] = False
+    torch.testing.assert_close(found[1], free[1] * shown[::reduction, ::reduction], rtol=1e-12, atol=1e-14)
+    assert (free[1] != 0).all()
+    plain = result(evidence[each, each], over=None)
+    torch.testing.assert_close(plain[1], free[1], rtol=1e-12, atol=1e-14)  # plain compositing is as in the paper
+
+
+def test_what_an_opaque_panel_lacks_does_not_color_splats_that_nothing_else_shows():
+    """A panel's color is 0.01 off, through 1 % of transmittance: the scene would take the whole difference."""
+    found = []
+    for known in (0.01, 1.0):
+        overlay = ScreenSpaceOverlay(1, 1)
+        overlay.initialize(torch.full((1, 1, 3), 0.5), torch.full((1, 1, 1), 0.99), torch.full((1, 1, 1), known))
+        splats = torch.full((1, 1, 3), 0.5, requires_grad=True)
+        optimizer = torch.optim.Adam([splats], lr=0.01)
+        for _ in range(100):
+            shown = overlay.composite(splats, behind=(torch.ones(1, 1, 1), torch.zeros(3)))
+            optimizer.zero_grad()
+            (shown - 0.51).abs().sum().backward()
+            optimizer.step()
+        found.append(float((splats.detach() - 0.5).abs().max()))
+    assert found[0] == 0
+    assert found[1] > 0.5
 
 
 @pytest.mark.parametrize(("evidence", "hidden"), [(0.3, True), (0.4, False)])
