@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
+from scipy.special import betainc
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence
@@ -20,8 +21,12 @@ area relative to what surrounds it. On three captures dashboards and buttons hav
 paths and skies between drops at least 0.45."""
 MIN_AREA = COARSE_FACTOR**2
 """Working pixels; smaller areas than a pixel of the coarse scale are ignored."""
+OUTLINE_SIGNIFICANCE = 0.01
+"""Probability, as of detection, with which as much of an outline is edges by chance."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 _MARGIN = 4
+_OUTLINE_WIDTH = 5
+"""Working pixels across an outline: of an edge, widened by two."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +51,15 @@ def artifact_area(edges: EdgeEvidence, statistics: ImageStatistics) -> ArtifactA
     reduction = statistics.brightness.reduction
     deviation = reduced_deviation(statistics.deviation().float(), reduction)[..., 0].cpu().numpy()
     low = low_deviation(deviation).astype(np.uint8)
-    outlines = cv2.dilate(edges.outlines, _NEIGHBORS, iterations=2)
-    enclosed = _areas_where(low, lambda box, area: _has_outline(outlines[box], area))
+    outlines = cv2.dilate(edges.outlines, _NEIGHBORS, iterations=_OUTLINE_WIDTH // 2)
+    usual = float(outlines[low == 0].mean()) if (low == 0).any() else 0.0
+    enclosed = _areas_where(low, lambda box, area: _has_outline(outlines[box], area, usual))
     hiding = enclosed | (edges.mask & low)
     level = deviation + GRAY_LEVEL
     closed = cv2.morphologyEx(hiding, cv2.MORPH_CLOSE, _NEIGHBORS)
-    opaque = _areas_where(closed, lambda box, area: _ends_abruptly(level[box], area))
+    opaque = _areas_where(
+        closed, lambda box, area: _has_outline(outlines[box], area, usual) and _ends_abruptly(level[box], area)
+    )
     layers = np.stack([cv2.dilate(edges.mask, _NEIGHBORS) | enclosed, opaque], axis=-1).astype(np.uint8)
     enlarged = cv2.resize(layers, None, fx=reduction, fy=reduction, interpolation=cv2.INTER_NEAREST)
     height, width = statistics.size
@@ -76,10 +84,18 @@ def connected_parts(area: Tensor, connectivity: int = 8) -> Tensor:
     return torch.from_numpy(labels).to(area.device, torch.int64)
 
 
-def _has_outline(outlines: np.ndarray, area: np.ndarray) -> bool:
-    """Whether at least half of an area's outline is edges: a uniform artifact has them, a uniform sky does not."""
+def _has_outline(outlines: np.ndarray, area: np.ndarray, usual: float) -> bool:
+    """Whether at least half of an area's outline is edges: a uniform artifact has them, a uniform sky does not.
+
+    Behind rain a sky has, too, but no more of them than anywhere: `usual` is the share of edges where views vary. Of
+    places on the outline as far apart as an edge is wide, so many are edges by chance with the probability of a
+    binomial distribution, continued to parts of a place.
+    """
     around = cv2.dilate(area, _NEIGHBORS) > area
-    return not around.any() or outlines[around].mean() >= 0.5
+    if not around.any():
+        return True
+    places, found = around.sum() / _OUTLINE_WIDTH, outlines[around].sum() / _OUTLINE_WIDTH
+    return bool(found >= places / 2 and betainc(found, places - found + 1, usual) < OUTLINE_SIGNIFICANCE)
 
 
 def _ends_abruptly(level: np.ndarray, area: np.ndarray) -> bool:

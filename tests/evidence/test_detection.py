@@ -126,6 +126,25 @@ def test_a_uniform_sky_without_static_edges_is_no_artifact():
     assert found.opaque[76:].all()
 
 
+@pytest.mark.parametrize("density", [0.012, 0.03, 0.05])
+def test_a_uniform_sky_behind_rain_is_not_opaque(density):
+    """Drops everywhere: the skyline is static edges, too, but so is nearly everything. A board's outline is not."""
+    rng = np.random.default_rng(2)
+    photos = [cv2.resize(photo, (512, 384)) for photo in capture(30)]
+    for photo in photos:
+        rows = 160 + np.round(6 * np.sin(np.arange(512) / 9 + rng.uniform(0, 6)) + rng.uniform(-6, 6)).astype(int)
+        photo[np.arange(384)[:, None] < rows] = (140, 170, 230)
+    drops = cv2.dilate((rng.random((384, 512)) < density).astype(np.uint8), np.ones((5, 5), np.uint8))
+    rain = behind(photos, 0.4 * drops.astype(np.float64))
+    found = detect(statistics_of(rain))
+    assert found.verdict == "faint"
+    assert not found.opaque.any()
+    panel = np.zeros((384, 512))
+    panel[250:340, 60:200] = 1.0
+    found = detect(statistics_of(behind(photos, panel)))
+    assert (found.opaque.numpy() == (panel > 0)).mean() > 0.99
+
+
 def test_recurring_content_that_moves_is_no_artifact():
     """A dark square in the middle of every view, as when walking around something: never twice at the same pixels."""
     photos = capture(40)
