@@ -55,7 +55,7 @@ DETECTION = {
         "MIN_STILL_SHARE",
     ),
     "null_distribution": ("MAX_SHIFT",),
-    "static_area": ("MAX_OPAQUE_DEVIATION",),
+    "static_area": ("MAX_OPAQUE_DEVIATION", "OUTLINE_SIGNIFICANCE"),
     "detection": ("SIGNIFICANCE", "MIN_OPAQUE_COVERAGE"),
 }
 """Constants of the modules in `evidence` that detect, which comes first."""

@@ -22,11 +22,11 @@ paths and skies between drops at least 0.45."""
 MIN_AREA = COARSE_FACTOR**2
 """Working pixels; smaller areas than a pixel of the coarse scale are ignored."""
 OUTLINE_SIGNIFICANCE = 0.01
-"""Probability, as of detection, with which as much of an outline is edges by chance."""
+"""An area is enclosed if its edges have at most this probability by chance. The level of detection, too."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 _MARGIN = 4
 _OUTLINE_WIDTH = 5
-"""Working pixels across an outline: of an edge, widened by two."""
+"""Working pixels across an outline: an edge of one, widened by two on each side."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,8 @@ def artifact_area(edges: EdgeEvidence, statistics: ImageStatistics) -> ArtifactA
     deviation = reduced_deviation(statistics.deviation().float(), reduction)[..., 0].cpu().numpy()
     low = low_deviation(deviation).astype(np.uint8)
     outlines = cv2.dilate(edges.outlines, _NEIGHBORS, iterations=_OUTLINE_WIDTH // 2)
-    usual = float(outlines[low == 0].mean()) if (low == 0).any() else 0.0
+    varying = (low == 0) & ~np.isnan(deviation)
+    usual = float(outlines[varying].mean()) if varying.any() else 0.0
     enclosed = _areas_where(low, lambda box, area: _has_outline(outlines[box], area, usual))
     hiding = enclosed | (edges.mask & low)
     level = deviation + GRAY_LEVEL
@@ -87,15 +88,25 @@ def connected_parts(area: Tensor, connectivity: int = 8) -> Tensor:
 def _has_outline(outlines: np.ndarray, area: np.ndarray, usual: float) -> bool:
     """Whether at least half of an area's outline is edges: a uniform artifact has them, a uniform sky does not.
 
-    Behind rain a sky has, too, but no more of them than anywhere: `usual` is the share of edges where views vary. Of
-    places on the outline as far apart as an edge is wide, so many are edges by chance with the probability of a
-    binomial distribution, continued to parts of a place.
+    Behind rain a sky has them, too, but no more than anywhere else. So there must be more on the outline than by
+    chance, or at least twice as many places without one inside, also not by chance, because a panel hides rain. By
+    chance a place is an edge with the probability `usual`, the share of edges where views vary; places are as far apart
+    as an outline is wide.
     """
     around = cv2.dilate(area, _NEIGHBORS) > area
     if not around.any():
         return True
-    places, found = around.sum() / _OUTLINE_WIDTH, outlines[around].sum() / _OUTLINE_WIDTH
-    return bool(found >= places / 2 and betainc(found, places - found + 1, usual) < OUTLINE_SIGNIFICANCE)
+    found = outlines[around] > 0
+    inside = outlines[cv2.erode(area, _NEIGHBORS, iterations=_OUTLINE_WIDTH) > 0] > 0
+    more = _tail(found.sum() / _OUTLINE_WIDTH, len(found) / _OUTLINE_WIDTH, usual) < OUTLINE_SIGNIFICANCE
+    without = (~inside).sum() / _OUTLINE_WIDTH**2, len(inside) / _OUTLINE_WIDTH**2
+    hides = _tail(*without, 1 - usual) < OUTLINE_SIGNIFICANCE and without[0] >= 2 * (1 - usual) * without[1]
+    return bool(found.mean() >= 0.5 and (more or hides))
+
+
+def _tail(found: float, places: float, probability: float) -> float:
+    """Probability of at least so many successes, by the binomial distribution, continued to parts of a place."""
+    return float(betainc(found, places - found + 1, probability)) if found > 0 else 1.0
 
 
 def _ends_abruptly(level: np.ndarray, area: np.ndarray) -> bool:

@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ssa_nerfstudio.evidence import detection, edge_evidence
+from ssa_nerfstudio.evidence import detection, edge_evidence, static_area
 from ssa_nerfstudio.evidence.detection import detect
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 
@@ -126,23 +126,70 @@ def test_a_uniform_sky_without_static_edges_is_no_artifact():
     assert found.opaque[76:].all()
 
 
-@pytest.mark.parametrize("density", [0.012, 0.03, 0.05])
-def test_a_uniform_sky_behind_rain_is_not_opaque(density):
-    """Drops everywhere: the skyline is static edges, too, but so is nearly everything. A board's outline is not."""
+def before_a_sky(views: int) -> list[np.ndarray]:
+    """Photos of 384 x 512 pixels: a plain sky, whose lower border moves, over the textured wall."""
     rng = np.random.default_rng(2)
-    photos = [cv2.resize(photo, (512, 384)) for photo in capture(30)]
+    photos = [cv2.resize(photo, (512, 384)) for photo in capture(views)]
     for photo in photos:
         rows = 160 + np.round(6 * np.sin(np.arange(512) / 9 + rng.uniform(0, 6)) + rng.uniform(-6, 6)).astype(int)
         photo[np.arange(384)[:, None] < rows] = (140, 170, 230)
-    drops = cv2.dilate((rng.random((384, 512)) < density).astype(np.uint8), np.ones((5, 5), np.uint8))
-    rain = behind(photos, 0.4 * drops.astype(np.float64))
-    found = detect(statistics_of(rain))
-    assert found.verdict == "faint"
+    return photos
+
+
+def rain(density: float) -> np.ndarray:
+    """Mattes of drops of 5 x 5 pixels, [384, 512]."""
+    drops = (np.random.default_rng(3).random((384, 512)) < density).astype(np.uint8)
+    return 0.4 * cv2.dilate(drops, np.ones((5, 5), np.uint8)).astype(np.float64)
+
+
+@pytest.mark.parametrize("masked", [0, 77, 173])
+@pytest.mark.parametrize("density", [0.012, 0.03, 0.05])
+def test_a_uniform_sky_behind_rain_is_not_opaque(density, masked):
+    """The skyline is static edges, but so is nearly everything that photos show; rows below may be masked."""
+    seen = torch.ones(384, 512, dtype=torch.bool)
+    seen[384 - masked :] = False
+    photos = behind(before_a_sky(30), rain(density))
+    found = detect(accumulate((torch.from_numpy(photo), seen) for photo in photos))
+    assert found.verdict != "none"
     assert not found.opaque.any()
+
+
+@pytest.mark.parametrize("density", [0.0, 0.012, 0.03, 0.05])
+@pytest.mark.parametrize("size", [(90, 140), (40, 60)])
+def test_a_panel_is_opaque_in_front_of_rain(density, size):
+    """Its outline is edges like all around it, but it hides the drops."""
     panel = np.zeros((384, 512))
-    panel[250:340, 60:200] = 1.0
-    found = detect(statistics_of(behind(photos, panel)))
-    assert (found.opaque.numpy() == (panel > 0)).mean() > 0.99
+    panel[250 : 250 + size[0], 60 : 60 + size[1]] = 1.0
+    found = detect(statistics_of(behind(behind(before_a_sky(30), rain(density)), panel, 0.1)))
+    assert not found.opaque[:200].any()
+    assert found.opaque[252 : 248 + size[0], 62 : 58 + size[1]].all()
+
+
+@pytest.mark.parametrize(
+    ("share", "inside", "usual", "enclosed"),
+    [
+        (1.0, 1.0, 0.1, True),
+        (0.55, 1.0, 0.1, True),
+        (0.45, 1.0, 0.1, False),
+        (0.45, 0.0, 0.9, False),
+        (0.9, 0.9, 0.9, False),
+        (0.9, 0.9, 0.8, False),
+        (0.9, 0.3, 0.9, True),
+        (0.9, 0.75, 0.9, True),
+        (0.9, 0.85, 0.9, False),
+        (1.0, 1.0, 1.0, False),
+        (0.6, 0.0, 0.0, True),
+    ],
+)
+def test_an_outline_has_more_edges_than_by_chance_or_surrounds_fewer(share, inside, usual, enclosed):
+    """A square of 60 pixels, of whose outline and inside these shares are edges."""
+    area = np.zeros((80, 80), np.uint8)
+    area[10:70, 10:70] = 1
+    rank = np.random.default_rng(4).permutation(6400).reshape(80, 80)
+    edges = np.zeros((80, 80), np.uint8)
+    for part, wanted in ((cv2.dilate(area, np.ones((3, 3), np.uint8)) > area, share), (area > 0, inside)):
+        edges[part] = rank[part].argsort().argsort() < wanted * part.sum()
+    assert static_area._has_outline(edges, area, usual) == enclosed
 
 
 def test_recurring_content_that_moves_is_no_artifact():
