@@ -136,10 +136,10 @@ def before_a_sky(views: int) -> list[np.ndarray]:
     return photos
 
 
-def rain(density: float) -> np.ndarray:
-    """Mattes of drops of 5 x 5 pixels, [384, 512]."""
-    drops = (np.random.default_rng(3).random((384, 512)) < density).astype(np.uint8)
-    return 0.4 * cv2.dilate(drops, np.ones((5, 5), np.uint8)).astype(np.float64)
+def rain(density: float, side: int = 5, opacity: float = 0.4) -> np.ndarray:
+    """The matte of square drops, [384, 512]; the density is that of drops of 5 x 5 pixels over the same area."""
+    drops = (np.random.default_rng(3).random((384, 512)) < density * 25 / side**2).astype(np.uint8)
+    return opacity * cv2.dilate(drops, np.ones((side, side), np.uint8)).astype(np.float64)
 
 
 @pytest.mark.parametrize("masked", [0, 77, 173])
@@ -152,6 +152,11 @@ def test_a_uniform_sky_behind_rain_is_not_opaque(density, masked):
     found = detect(accumulate((torch.from_numpy(photo), seen) for photo in photos))
     assert found.verdict != "none"
     assert not found.opaque.any()
+
+
+def test_drops_that_hide_most_of_a_sky_are_not_opaque():
+    """They vary less than a fifth of the wall, and join to areas with edges all around, like all of the frame."""
+    assert not detect(statistics_of(behind(before_a_sky(30), rain(0.03, 9, 0.7)))).opaque.any()
 
 
 @pytest.mark.parametrize("density", [0.0, 0.012, 0.03, 0.05])
