@@ -96,12 +96,15 @@ def _has_outline(outlines: np.ndarray, area: np.ndarray, usual: float) -> bool:
     around = cv2.dilate(area, _NEIGHBORS) > area
     if not around.any():
         return True
-    found = outlines[around] > 0
-    inside = outlines[cv2.erode(area, _NEIGHBORS, iterations=_OUTLINE_WIDTH) > 0] > 0
-    more = _tail(found.sum() / _OUTLINE_WIDTH, len(found) / _OUTLINE_WIDTH, usual) < OUTLINE_SIGNIFICANCE
-    without = (~inside).sum() / _OUTLINE_WIDTH**2, len(inside) / _OUTLINE_WIDTH**2
-    hides = _tail(*without, 1 - usual) < OUTLINE_SIGNIFICANCE and without[0] >= 2 * (1 - usual) * without[1]
-    return bool(found.mean() >= 0.5 and (more or hides))
+    edges = outlines[around] > 0
+    if edges.mean() < 0.5:
+        return False
+    if _tail(edges.sum() / _OUTLINE_WIDTH, len(edges) / _OUTLINE_WIDTH, usual) < OUTLINE_SIGNIFICANCE:
+        return True
+    plain = outlines[cv2.erode(area, _NEIGHBORS, iterations=_OUTLINE_WIDTH) > 0] == 0
+    without, places = plain.sum() / _OUTLINE_WIDTH**2, len(plain) / _OUTLINE_WIDTH**2
+    often = without >= 2 * (1 - usual) * places
+    return bool(often and _tail(without, places, 1 - usual) < OUTLINE_SIGNIFICANCE)
 
 
 def _tail(found: float, places: float, probability: float) -> float:

@@ -58,8 +58,8 @@ class ModelSettings(SplatfactoModelConfig):
     0.05, and 0.01 for mud."""
     ignore_background: bool = True
     """Take the matte's gradient as if the overlay's color were the background, so that hiding background that no
-    splat covers (a sky without points) is not rewarded, unless the start says that an artifact hides the scene there;
-    False: plain compositing, as in the paper."""
+    splat covers (a sky without points) is not rewarded, unless the start says that an artifact hides the scene there:
+    while the matte agrees, the scene learns nothing from such pixels. False: plain compositing, as in the paper."""
     ignore_changing: bool = True
     """Where the estimate from points finds an artifact that changes from photo to photo, such as a weapon that sways,
     or an occlusion where `shading` is not off and no exposure is learned, the photos teach the scene nothing; False:

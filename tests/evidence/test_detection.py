@@ -110,13 +110,19 @@ def test_a_uniform_corner_is_found_though_it_has_few_edges(views):
     assert found.coverage == pytest.approx(0.0625, abs=0.02)
 
 
+def draw_sky(photos: list[np.ndarray], horizon: int, seed: int) -> None:
+    """Draw a plain sky into photos, down to a border around a row, which moves from photo to photo."""
+    rng = np.random.default_rng(seed)
+    for photo in photos:
+        height, width, _ = photo.shape
+        waves = 6 * np.sin(np.arange(width) / 9 + rng.uniform(0, 6)) + rng.uniform(-6, 6)
+        photo[np.arange(height)[:, None] < horizon + np.round(waves).astype(int)] = (140, 170, 230)
+
+
 def test_a_uniform_sky_without_static_edges_is_no_artifact():
     """All views agree on the upper half; its lower border moves, as a skyline does. The board below does not."""
     photos = behind(capture(30), board())
-    rng = np.random.default_rng(5)
-    for photo in photos:
-        rows = 40 + np.round(6 * np.sin(np.arange(WIDTH) / 9 + rng.uniform(0, 6)) + rng.uniform(-6, 6)).astype(int)
-        photo[np.arange(HEIGHT)[:, None] < rows] = (140, 170, 230)
+    draw_sky(photos, 40, seed=5)
     statistics = statistics_of(photos)
     assert float(statistics.deviation()[:24].max()) == 0
     found = detect(statistics)
@@ -128,11 +134,8 @@ def test_a_uniform_sky_without_static_edges_is_no_artifact():
 
 def before_a_sky(views: int) -> list[np.ndarray]:
     """Photos of 384 x 512 pixels: a plain sky, whose lower border moves, over the textured wall."""
-    rng = np.random.default_rng(2)
     photos = [cv2.resize(photo, (512, 384)) for photo in capture(views)]
-    for photo in photos:
-        rows = 160 + np.round(6 * np.sin(np.arange(512) / 9 + rng.uniform(0, 6)) + rng.uniform(-6, 6)).astype(int)
-        photo[np.arange(384)[:, None] < rows] = (140, 170, 230)
+    draw_sky(photos, 160, seed=2)
     return photos
 
 
