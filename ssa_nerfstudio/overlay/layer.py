@@ -28,7 +28,9 @@ COLOR_LOGIT_RANGE = (-12.0, 12.0)
 """Range of the learned color's logits: 6e-6 to 1 - 6e-6, for the same reason."""
 HIDDEN_BELOW = 0.1
 """Transmittance below which photos say next to nothing of the scene: what they say is in proportion to its square. A
-backdrop is behind such pixels, their matte may hide background, and while it agrees, the scene learns nothing there."""
+backdrop is behind such pixels, and their matte may hide background."""
+UNSEEN_BELOW = 1 / 255
+"""Transmittance below which a white scene makes less than a gray level of a photo."""
 OPTIONAL_BUFFERS = ("falloff", "reliable", "noise")
 """Buffers of an overlay that have one pixel of value 1 where nothing is known of them, as in earlier checkpoints."""
 
@@ -151,8 +153,8 @@ class ScreenSpaceOverlay(nn.Module):
             reduction: 1, 2, 4 or 8: factor by which training images are reduced.
             behind: opacity of the splats [H // reduction, W // reduction, 1] and color of the background [3], for the
                 matte's gradient of `composite_over_splats`, but for pixels of which the initialization says that they
-                hide the scene (`evidence` below HIDDEN_BELOW): hiding background is what they do. While their matte
-                is above 1 - HIDDEN_BELOW, too, the scene gets no gradient from them. None for plain compositing.
+                hide the scene (`evidence` below HIDDEN_BELOW): hiding background is what they do. While they transmit
+                less than UNSEEN_BELOW, too, the scene gets no gradient from them. None for plain compositing.
             light: a factor of B, of the render's shape; None for 1.
 
         Returns:
@@ -167,7 +169,7 @@ class ScreenSpaceOverlay(nn.Module):
                 # Adam's steps do not shrink with the gradient: splats that are seen only through 0.1 % would learn at
                 # full rate what the panel's color lacks.
                 with torch.no_grad():
-                    hides = known & (self._at_training_scale(self.matte(), reduction) > 1 - HIDDEN_BELOW)
+                    hides = known & (self._at_training_scale(self.matte(), reduction) > 1 - UNSEEN_BELOW)
                 clean = torch.where(hides, clean.detach(), clean)
         if self.resolution == reduction == 1 and not self.adds_light and light is None:
             image = composite_logits(clean, self.color_logits, self.alpha_logits, behind)

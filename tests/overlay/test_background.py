@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ssa_nerfstudio.overlay.compositing import composite, composite_logits, composite_over_splats
-from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
+from ssa_nerfstudio.overlay.layer import MATTE_LOGIT_RANGE, ScreenSpaceOverlay
 from ssa_nerfstudio.overlay.sparsity import sparsity_loss
 
 
@@ -187,8 +187,8 @@ def test_the_scene_learns_nothing_where_initialization_and_matte_say_that_it_is_
     """Each quarter of the frame has another answer; the image, the color's and the matte's gradient stay the same."""
     generator = torch.Generator().manual_seed(4)
     overlay = any_overlay(resolution, adds_light, generator)
-    matte, evidence = torch.full((6, 8, 1), 0.89), torch.full((6, 8, 1), 0.11)
-    matte[2:], evidence[:, 4:] = 0.91, 0.09
+    matte, evidence = torch.full((6, 8, 1), 1 - 1.1 / 255), torch.full((6, 8, 1), 0.11)
+    matte[2:], evidence[:, 4:] = 1 - 0.9 / 255, 0.09
     each = slice(None, None, resolution)
     with torch.no_grad():
         overlay.alpha_logits.copy_(matte[each, each].logit())
@@ -216,17 +216,19 @@ def test_the_scene_learns_nothing_where_initialization_and_matte_say_that_it_is_
 
 
 def test_what_an_opaque_panel_lacks_does_not_color_splats_that_nothing_else_shows():
-    """A panel's color is 0.01 off, through 1 % of transmittance: the scene would take the whole difference."""
+    """A panel's color is 0.001 off, through 0.1 % of transmittance: the scene would take the whole difference."""
     found = []
     for known in (0.01, 1.0):
         overlay = ScreenSpaceOverlay(1, 1)
         overlay.initialize(torch.full((1, 1, 3), 0.5), torch.full((1, 1, 1), 0.99), torch.full((1, 1, 1), known))
+        with torch.no_grad():
+            overlay.alpha_logits.fill_(MATTE_LOGIT_RANGE[1])
         splats = torch.full((1, 1, 3), 0.5, requires_grad=True)
         optimizer = torch.optim.Adam([splats], lr=0.01)
         for _ in range(100):
             shown = overlay.composite(splats, behind=(torch.ones(1, 1, 1), torch.zeros(3)))
             optimizer.zero_grad()
-            (shown - 0.51).abs().sum().backward()
+            (shown - 0.501).abs().sum().backward()
             optimizer.step()
         found.append(float((splats.detach() - 0.5).abs().max()))
     assert found[0] == 0
