@@ -17,7 +17,7 @@ from record_game import TALL, UNIT
 from ssa_nerfstudio.cli import run_script
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.gap_points import SPACING, photos_to_fill
-from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, pixels_of
+from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, projections
 
 STRETCH = UNIT * np.array([1, 1, TALL])
 """World units per unit of a map."""
@@ -92,14 +92,14 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
     distant, gaps = seeds.distant, seeds.gaps
     seen, sky = np.zeros(len(distant)), np.zeros(len(distant))
     for photo in photos:
-        index = pixels_of(distant.positions, photo)[0]
+        index = _in_frame(distant.positions, photo)
         if len(index):
             seen[index.numpy()] += 1
             sky[index.numpy()] += ~trace(photo, distant.positions[index])[1]
     ratios = np.full(len(gaps), np.nan)
     for photo in photos_to_fill(photos):
         # A seed is as wide as SPACING working pixels of the photo that it fills.
-        pose, index = photo.view.world_to_camera.to(gaps.positions), pixels_of(gaps.positions, photo)[0]
+        pose, index = photo.view.world_to_camera.to(gaps.positions), _in_frame(gaps.positions, photo)
         depth = (gaps.positions[index] @ pose[:3, :3].T + pose[:3, 3])[:, 2]
         stated = gaps.widths[index] * photo.view.intrinsics[0, 0] / (SPACING * photo.reduction)
         own = (stated / depth - 1).abs() < 1e-4
@@ -108,6 +108,12 @@ def _measure(path: Path, world: Map) -> tuple[np.ndarray, np.ndarray]:
             ratio, solid = trace(photo, gaps.positions[index])
             ratios[index.numpy()] = np.where(solid, ratio, 0.0)
     return sky / np.maximum(seen, 1), ratios[np.isfinite(ratios)]
+
+
+def _in_frame(positions: torch.Tensor, photo: ScenePhoto) -> torch.Tensor:
+    """Indices of the positions [N, 3] in the frame of a photo."""
+    [seen] = projections(positions, [photo])
+    return seen.index
 
 
 if __name__ == "__main__":

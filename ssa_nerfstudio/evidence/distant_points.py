@@ -21,7 +21,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
 from ssa_nerfstudio.evidence.point_samples import order_by_point, regular_subset, summed
-from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, near_points, pixels_of
+from ssa_nerfstudio.evidence.scene_photos import ScenePhoto, near_points, projections
 from ssa_nerfstudio.evidence.seeds import Seeds
 
 SPACING = 2.0
@@ -75,16 +75,15 @@ def distant_points(points: Tensor, photos: Sequence[ScenePhoto], sphere: Sphere)
     angles = [photo.reduction / float(photo.view.intrinsics[0, 0]) for photo in photos]
     angle = max(SPACING * sum(angles) / len(angles), math.sqrt(4 * math.pi / MAX_DIRECTIONS))
     directions = _directions(round(4 * math.pi / angle**2)).to(points)
-    taken = [near_points(points, photo, OCCLUSION_RADIUS).flatten() for photo in photos]
-    frames = list(zip(photos, taken, _still_pictures(photos), strict=True))
-    far = _sights(center + radius * directions, frames)
+    near, pictures = near_points(points, photos, OCCLUSION_RADIUS), _still_pictures(photos)
+    far = _sights(center + radius * directions, photos, near, pictures)
     likely = (far.counted >= MIN_SIGHTS) & (2 * far.counted >= far.shown)
     candidates = likely.nonzero()[:, 0]
     if not len(candidates):
         return Seeds.none(points)
     nearer = [at for at in nearer if at > 0 and baseline * (1 / at - 1 / radius) > angle]
     cost, still = far.cost()[candidates], far.still_cost()[candidates]
-    alternatives = [_sights(center + at * directions[candidates], frames).cost() for at in nearer]
+    alternatives = [_sights(center + at * directions[candidates], photos, near, pictures).cost() for at in nearer]
     distant = _distant(directions[candidates], angle, cost - still, [cost - other for other in alternatives])
     found = candidates[distant]
     positions = center + radius * directions[found]
@@ -252,11 +251,11 @@ def _connected(directions: Tensor, angle: float) -> Tensor:
 
 
 def _still_pictures(photos: Sequence[ScenePhoto]) -> list[Tensor]:
-    """For each photo another of its group and size, a third of them further, [h w, 3]; NaN where that shows nothing."""
+    """For each photo another of its group and size, a third of them further, [h, w, 3]; NaN where it shows nothing."""
     alike: dict[tuple[int, tuple[int, int]], list[int]] = {}
     for number, photo in enumerate(photos):
         alike.setdefault((photo.group, photo.size), []).append(number)
-    pictures = [torch.where(photo.shown, photo.color, torch.nan).reshape(-1, 3) for photo in photos]
+    pictures = [torch.where(photo.shown, photo.color, torch.nan) for photo in photos]
     others = [torch.full_like(picture, torch.nan) for picture in pictures]
     for members in alike.values():
         if len(members) >= MIN_SIGHTS:
@@ -270,23 +269,27 @@ def _another(place: _Place, count: _Place) -> _Place:
     return (place + count // 3) % count
 
 
-def _sights(positions: Tensor, frames: Sequence[tuple[ScenePhoto, Tensor, Tensor]]) -> _Sights:
-    """What the photos show of positions [N, 3].
+def _sights(
+    positions: Tensor, photos: Sequence[ScenePhoto], near: Sequence[Tensor], pictures: Sequence[Tensor]
+) -> _Sights:
+    """What photos show of positions [N, 3].
 
     Args:
         positions: world units.
-        frames: photos, where each is `near_points`, and its picture of `_still_pictures`.
+        photos: at least one.
+        near: where each is `near_points`.
+        pictures: of each, `_still_pictures`.
     """
     count, sights = len(positions), []
-    for number, (photo, near, picture) in enumerate(frames):
-        index, pixel = pixels_of(positions, photo)
-        color, still = (each.reshape(-1, 3).to(positions)[pixel] for each in (photo.color, picture))
-        shown = photo.shown.flatten().to(positions.device)[pixel]
-        sights.append((index, torch.full_like(index, number), color, still, shown, shown & ~near[pixel]))
+    colors, masks = [photo.color for photo in photos], [photo.shown for photo in photos]
+    for seen in projections(positions, photos):
+        color, still = (seen.read(each).to(positions) for each in (colors, pictures))
+        shown = seen.read(masks)[:, 0]
+        sights.append((seen.index, seen.view + seen.first, color, still, shown, shown & ~seen.read(near)[:, 0]))
     index, view, color, still, shown, counts = (torch.cat(each) for each in zip(*sights, strict=True))
     shown = torch.bincount(index[shown], minlength=count)
     counts = counts.nonzero()[:, 0]
     in_views = counts[torch.argsort(index[counts], stable=True)]
     index, view, color, still = index[in_views], view[in_views], color[in_views], still[in_views]
     counted = torch.bincount(index, minlength=count)
-    return _Sights(index, view, color, still, counted, shown, len(frames))
+    return _Sights(index, view, color, still, counted, shown, len(photos))

@@ -110,7 +110,7 @@ def _behind(photo: ScenePhoto, taken: Tensor, far: Sphere) -> Seeds:
 def _gaps(photo: ScenePhoto, taken: Tensor, where: Tensor) -> Tensor:
     """Row and column [G, 2] of those pixels of the grid, `where` [h, w] is True, that have no position [P, 3] around,
     hidden or not."""
-    return _on_grid(where.to(taken.device) & ~near_points(taken, photo, SPACING)).nonzero()
+    return _on_grid(where.to(taken.device) & ~near_points(taken, [photo], SPACING)[0][..., 0]).nonzero()
 
 
 def _on_grid(mask: Tensor) -> Tensor:
@@ -178,8 +178,15 @@ def _hide_points(positions: Tensor, spaces: Sequence[_FreeSpace]) -> Tensor:
 
 def _in_hull(gaps: Tensor, places: Tensor) -> Tensor:
     """[G] bool: whether a pixel [G, 2] is between others [M, 2], in their convex hull; on one line nothing is."""
+    # The hull of all is that of the two ends of each row.
+    rows, columns = places.cpu().unbind(dim=-1)
+    height = int(rows.max()) + 1
+    filled = (torch.bincount(rows, minlength=height) > 0).nonzero()[:, 0]
+    columns_of = columns.new_zeros(height)
+    ends = [columns_of.scatter_reduce(0, rows, columns, end, include_self=False) for end in ("amin", "amax")]
+    outline = torch.cat([torch.stack([filled, end[filled]], dim=-1) for end in ends])
     try:
-        sides = torch.from_numpy(ConvexHull(places.cpu().numpy()).equations)
+        sides = torch.from_numpy(ConvexHull(outline.numpy()).equations)
     except QhullError:
         return torch.zeros_like(gaps[:, 0], dtype=torch.bool)
     inside = gaps.cpu().to(sides) @ sides[:, :2].mT + sides[:, 2] <= 1e-9

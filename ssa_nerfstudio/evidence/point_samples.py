@@ -22,7 +22,7 @@ MAX_PROJECTIONS = 5_000_000
 VIEWS_AT_ONCE = 64
 """Views whose points are compared by depth together; a larger number only costs memory."""
 VALUES_AT_ONCE = 2**24
-"""Color values of photos that are read together on a GPU, which waits for its host. A CPU's cache is for one photo."""
+"""Values of photos that are worked on together on a GPU, which waits for its host. A CPU's cache is for one photo."""
 MIN_DEPTH = 1e-6
 """World units; points nearer to a camera's plane are behind it."""
 
@@ -135,7 +135,7 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     farthest = seen.depth.new_zeros(len(points)).scatter_reduce(0, seen.point, seen.depth, "amax")
     footprint = (2 * OCCLUSION_RADIUS + 1) * farthest[seen.point] / seen.depth
     counts = torch.bincount(seen.view, minlength=len(views)).tolist()
-    colors, patches, kept, at_once = [], [], [], _photos_at_once(points.device, 3 * height * width)
+    colors, patches, kept, at_once = [], [], [], photos_at_once(points.device, 3 * height * width)
     ends = [0, *accumulate(counts)]
     for first in range(0, len(views), at_once):
         some = views[first : first + at_once]
@@ -174,9 +174,9 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     return PointSamples(point, pixel, color, len(points), size, shown_by, patch, ratio).ordered()
 
 
-def _photos_at_once(device: torch.device, values: int) -> int:
-    """Number of photos, each of so many color values, that are read together."""
-    return max(1, VALUES_AT_ONCE // values) if device.type == "cuda" else 1
+def photos_at_once(device: torch.device, values: int) -> int:
+    """Number of photos, with so many values each, that are worked on together."""
+    return max(1, VALUES_AT_ONCE // max(1, values)) if device.type == "cuda" else 1
 
 
 def regular_subset(points: Tensor, views: int) -> Tensor:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import torch
 from torch import Tensor, nn
 
 from ssa_nerfstudio.evidence.guided_upsampling import reduced
-from ssa_nerfstudio.evidence.point_samples import View, project, working_pixels, working_reduction
+from ssa_nerfstudio.evidence.point_samples import View, photos_at_once, project, working_pixels, working_reduction
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE
 from ssa_nerfstudio.overlay.layer import HIDDEN_BELOW
 
@@ -63,26 +64,58 @@ def scene_photos(
     """
     by_group = sorted(range(len(views)), key=lambda view: groups[view])
     kept = by_group[:: -(-len(views) // MAX_VIEWS)]
-    artifacts = {id(pair): _reduced_layers(pair, views[view]) for view in kept if (pair := layers[view])}
+    of_artifacts = {id(pair): (pair, views[view]) for view in kept if (pair := layers[view])}
+    artifacts = {key: _reduced_layers(*artifact) for key, artifact in of_artifacts.items()}
     return [
         _scene_photo(views[view], groups[view], artifacts.get(id(layers[view])), artifact_is_exposed) for view in kept
     ]
 
 
-def pixels_of(positions: Tensor, photo: ScenePhoto) -> tuple[Tensor, Tensor]:
-    """Indices [M] of the positions [N, 3] in the frame of a photo, and their working pixels [M], row by row."""
-    height, width = photo.size
-    poses, lenses = photo.view.world_to_camera[None], photo.view.intrinsics[None]
-    _, index, position, _ = project(positions, poses, lenses, height * photo.reduction, width * photo.reduction)
-    return index, working_pixels(position, photo.size, photo.reduction)
+@dataclass(frozen=True)
+class Projections:
+    """Which of N positions are in the frames of some photos of one size: M pairs, photo by photo."""
+
+    photos: Sequence[ScenePhoto]
+    """V of them."""
+    first: int
+    """Number of the first among all."""
+    view: Tensor
+    """[M] int64 in [0, V): the photo."""
+    index: Tensor
+    """[M] int64: the position."""
+    pixel: Tensor
+    """[M] int64: working pixel, row by row."""
+
+    def read(self, pictures: Sequence[Tensor]) -> Tensor:
+        """Values [M, C] of pictures [h, w, C], one for each of all photos."""
+        own = torch.stack(list(pictures[self.first : self.first + len(self.photos)])).to(self.pixel.device)
+        return own.flatten(1, 2)[self.view, self.pixel]
 
 
-def near_points(points: Tensor, photo: ScenePhoto, radius: int) -> Tensor:
-    """[h, w] bool: within a radius, working pixels, of one of the points [N, 3], hidden or not."""
-    height, width = photo.size
-    taken = torch.zeros(height * width, device=points.device)
-    taken[pixels_of(points, photo)[1]] = 1
-    return nn.functional.max_pool2d(taken.reshape(1, height, width), 2 * radius + 1, 1, radius)[0] > 0
+def projections(positions: Tensor, photos: Sequence[ScenePhoto]) -> Iterator[Projections]:
+    """Of positions [N, 3] into photos; into many at a time on a GPU, which waits for its host."""
+    first = 0
+    for (size, reduction), run in groupby(photos, key=lambda photo: (photo.size, photo.reduction)):
+        alike = list(run)
+        at_once = photos_at_once(positions.device, positions.numel())
+        for some in (alike[start : start + at_once] for start in range(0, len(alike), at_once)):
+            poses = torch.stack([photo.view.world_to_camera for photo in some])
+            lenses = torch.stack([photo.view.intrinsics for photo in some])
+            view, index, place, _ = project(positions, poses, lenses, size[0] * reduction, size[1] * reduction)
+            yield Projections(some, first, view, index, working_pixels(place, size, reduction))
+            first += len(some)
+
+
+def near_points(points: Tensor, photos: Sequence[ScenePhoto], radius: int) -> list[Tensor]:
+    """For each photo [h, w, 1] bool: within a radius, working pixels, of one of the points [N, 3], hidden or not."""
+    near: list[Tensor] = []
+    for seen in projections(points, photos):
+        height, width = seen.photos[0].size
+        taken = torch.zeros(len(seen.photos), height * width, device=points.device)
+        taken[seen.view, seen.pixel] = 1
+        widened = nn.functional.max_pool2d(taken.reshape(-1, height, width), 2 * radius + 1, 1, radius)
+        near.extend((widened > 0)[..., None])
+    return near
 
 
 def _reduced_layers(layers: tuple[Tensor, Tensor], view: View) -> tuple[Tensor, Tensor]:

@@ -150,7 +150,7 @@ class SSAPipeline(VanillaPipeline):
         elif seeds is not None and len(seeds[0]):
             size = int(cameras.width.max()), int(cameras.height.max())
             poses, Ks = view_matrix(cameras.camera_to_worlds), cameras.get_intrinsics_matrices()
-            self.model.set_near_plane(nearest_depth(seeds[0], poses, Ks, *size))
+            self.model.set_near_plane(nearest_depth(seeds[0].to(self.model.device), poses, Ks, *size))
 
     def _start_exposure(self) -> list[PointSamples] | None:
         exposure, place, photos = self.model.exposure, self.config.model.exposure_place, self.datamanager.train_dataset

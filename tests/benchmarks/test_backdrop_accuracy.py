@@ -13,8 +13,11 @@ from ssa_nerfstudio.evidence import gap_points
 
 
 def test_a_row_for_each_backdrop_the_more_counts_as_hidden_the_larger(tiny_scene, capsys, monkeypatch):
+    def nowhere(points, photos, radius):
+        return [torch.zeros(*photo.size, 1).bool() for photo in photos]
+
     # The scene has points everywhere.
-    monkeypatch.setattr(gap_points, "near_points", lambda points, photo, radius: torch.zeros(photo.size).bool())
+    monkeypatch.setattr(gap_points, "near_points", nowhere)
     settings = ("num_downscales=0", "overlay=on")
     Command(tiny_scene, steps=3, settings=settings, hidden=(0.0, 0.1, 1.0)).run()
     head, _, bare, *rows = capsys.readouterr().out.splitlines()

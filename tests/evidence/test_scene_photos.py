@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
+from ssa_nerfstudio.evidence import scene_photos as scene_photos_module
 from ssa_nerfstudio.evidence.point_samples import View
-from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS, MIN_SHOWN, scene_photos
+from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS, MIN_SHOWN, near_points, projections, scene_photos
 from ssa_nerfstudio.overlay.layer import HIDDEN_BELOW
 
 HEIGHT, WIDTH = 12, 16
@@ -57,3 +59,36 @@ def test_between_shown_and_hidden_a_film_leaves_something_of_the_scene() -> None
     assert torch.equal(masked.hidden, ~masked.shown)
     assert torch.equal(both.hidden, dark.hidden | masked.hidden)
     assert masked.hidden[0].all()
+
+
+@pytest.mark.parametrize("at_once", [2, 3, 100])
+def test_photos_that_are_projected_into_together_give_what_each_gives_alone(monkeypatch, at_once) -> None:
+    generator = torch.Generator().manual_seed(0)
+    positions = torch.rand(50, 3, generator=generator) * 2 - torch.tensor([1.0, 1.0, 0.3])
+    lens = torch.tensor([[10.0, 0, WIDTH / 2], [0, 10, HEIGHT / 2], [0, 0, 1]])
+    views = []
+    for number in range(7):  # the fifth has another size
+        pose = torch.eye(4)
+        pose[:3, 3] = torch.rand(3, generator=generator) / 2
+        height = HEIGHT + 4 * (number == 4)
+        views.append(View(torch.rand(height, WIDTH, 3, generator=generator), None, pose, lens))
+    photos = scene_photos(views, [None] * 7, [0] * 7)
+    pictures = [photo.color for photo in photos]
+
+    def found() -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+        parts = list(projections(positions, photos))
+        assert [part.first for part in parts] == [sum(len(p.photos) for p in parts[:at]) for at in range(len(parts))]
+        pairs = [(part.view + part.first, part.index, part.pixel, part.read(pictures)) for part in parts]
+        return [torch.cat(each) for each in zip(*pairs, strict=True)], near_points(positions, photos, 1)
+
+    (number, index, pixel, color), near = found()
+    monkeypatch.setattr(scene_photos_module, "photos_at_once", lambda device, values: at_once)
+    together, near_together = found()
+    assert all(map(torch.equal, (number, index, pixel, color), together))
+    assert all(map(torch.equal, near, near_together))
+    assert len(set(number.tolist())) == 7
+    for at, photo in enumerate(photos):
+        own = number == at
+        torch.testing.assert_close(color[own], photo.color.flatten(0, 1)[pixel[own]], rtol=0, atol=0)
+        assert near[at].flatten()[pixel[own]].all()
+        assert not near[at].all()
