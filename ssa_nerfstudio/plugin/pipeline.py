@@ -28,7 +28,6 @@ from ssa_nerfstudio.plugin.exposure_setup import start_beside_artifact, start_fr
 from ssa_nerfstudio.plugin.extra_seeds import find_extra_seeds
 from ssa_nerfstudio.plugin.face_overlaps import faces_of
 from ssa_nerfstudio.plugin.first_view import FirstView
-from ssa_nerfstudio.plugin.kernel_loading import load_kernels_meanwhile
 from ssa_nerfstudio.plugin.mask_check import check_masks
 from ssa_nerfstudio.plugin.model import SSASplatfactoModel, SSASplatfactoModelConfig
 from ssa_nerfstudio.plugin.overlay_setup import NamedPhoto, given_overlays, learned_overlays
@@ -37,6 +36,7 @@ from ssa_nerfstudio.plugin.shared_sphere import EVERY, SharedSphere
 from ssa_nerfstudio.plugin.training.checkpoints import load_pipeline_state
 from ssa_nerfstudio.plugin.training.densification import gaussian_budget
 from ssa_nerfstudio.plugin.training.seed_points import add_seeds, nearest_depth
+from ssa_nerfstudio.plugin.triton_loading import load_triton_meanwhile
 from ssa_nerfstudio.plugin.validation import check_device, check_first_resolution, check_settings, check_views
 from ssa_nerfstudio.plugin.view_geometry import extent, view_matrix
 
@@ -76,7 +76,7 @@ class SSAPipeline(VanillaPipeline):
         check_settings(config.model, device)
         check_data(config, test_mode)
         if test_mode == "val" and torch.device(device).type == "cuda":
-            load_kernels_meanwhile(torch.device(device))
+            load_triton_meanwhile()
         super().__init__(config, device, test_mode, world_size, local_rank, grad_scaler)
         self.sphere: SharedSphere | None = None
         check_views(self.datamanager.train_dataparser_outputs, _source(config))
