@@ -114,7 +114,7 @@ def test_a_patch_shows_the_same_of_the_scene_from_near_and_far() -> None:
 def test_many_views_are_sampled_as_each_by_itself(monkeypatch: pytest.MonkeyPatch, at_once: int) -> None:
     """Also where they are more than are projected at once, some have masks, and photos are of different types."""
     monkeypatch.setattr(point_samples, "VIEWS_AT_ONCE", 2)
-    monkeypatch.setattr(point_samples, "_photos_at_once", lambda *_: at_once)
+    monkeypatch.setattr(point_samples, "photos_at_once", lambda *_: at_once)
     generator = torch.Generator().manual_seed(0)
     points = torch.rand(300, 3, generator=generator) * torch.tensor([4.0, 4.0, 3.0]) + torch.tensor([-2.0, -2.0, 1.0])
     types = [torch.uint8, torch.float32, torch.uint16, torch.uint8, torch.float32]
@@ -132,7 +132,7 @@ def test_many_views_are_sampled_as_each_by_itself(monkeypatch: pytest.MonkeyPatc
         assert together.point[own].tolist() == alone.point.tolist()
         assert together.pixel[own].tolist() == alone.pixel.tolist()
         torch.testing.assert_close(together.color[own], alone.color)
-    monkeypatch.setattr(point_samples, "_photos_at_once", lambda *_: 1)
+    monkeypatch.setattr(point_samples, "photos_at_once", lambda *_: 1)
     torch.testing.assert_close(together.patch, sample_points(points, views, guide).patch)
 
 
@@ -168,7 +168,7 @@ def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks(
     monkeypatch: pytest.MonkeyPatch, at_once: int
 ) -> None:
     """Of noise, around points in the frame's corners and beside a mask, under a gain for each channel."""
-    monkeypatch.setattr(point_samples, "_photos_at_once", lambda *_: at_once)
+    monkeypatch.setattr(point_samples, "photos_at_once", lambda *_: at_once)
     generator = torch.Generator().manual_seed(0)
     images = torch.randint(0, 256, (2, 40, 60, 3), generator=generator, dtype=torch.uint8)
     mask = torch.rand(40, 60, generator=generator) > 0.2
