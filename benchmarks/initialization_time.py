@@ -1,8 +1,8 @@
-"""Seconds of each part of an overlay's initialization: `python benchmarks/initialization_time.py --data DIR`
+"""Seconds of each part of an overlay's start: `python benchmarks/initialization_time.py --data DIR`
 
 Each round is a process of its own, because loading kernels is part of a start. Parts are timed with the GPU idle before
-and after. They are nested: `learned_overlays` is all of it, and `estimate` holds `estimate_falloff` and
-`estimate_layers`.
+and after. They are nested: `learned_overlays` is all of the overlay, `estimate` holds `estimate_falloff` and
+`estimate_layers`, and `find_extra_seeds` holds `distant_points` and `gap_points`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import functools, json, sys, time
 from pathlib import Path
 import torch
 from ssa_nerfstudio.evidence import initialization
-from ssa_nerfstudio.plugin import overlay_setup
+from ssa_nerfstudio.plugin import extra_seeds, overlay_setup, pipeline
 parts = {}
 def now():
     if torch.cuda.is_available():
@@ -39,10 +39,14 @@ def timed(module, name):
         parts[name] = parts.get(name, 0.0) + now() - begin
         return result
     setattr(module, name, timing)
-for name in ("change_points", "detect", "sample_points", "estimate", "initialize_from", "learned_overlays"):
+for name in ("change_points", "detect", "sample_points", "estimate", "initialize_from"):
     timed(overlay_setup, name)
 for name in ("estimate_falloff", "estimate_layers"):
     timed(initialization, name)
+for name in ("learned_overlays", "nearest_depth", "find_extra_seeds"):
+    timed(pipeline, name)
+for name in ("distant_points", "gap_points"):
+    timed(extra_seeds, name)
 from ssa_nerfstudio.experiments.runs.run_configuration import configure
 config = configure("ssa-splatfacto", Path(sys.argv[1]), Path(sys.argv[2]), 1)
 config.pipeline.model.overlay = "on"
@@ -54,7 +58,7 @@ print("PARTS", json.dumps(parts))
 
 @dataclass
 class Command:
-    """Time the parts of an overlay's initialization, from decoded photos on."""
+    """Time the parts of an overlay's start, from decoded photos on."""
 
     data: Path
     """A nerfstudio dataset."""
