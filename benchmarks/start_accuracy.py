@@ -34,6 +34,7 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initializ
 from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE, LayerEstimate
 from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light, second_estimate
 from ssa_nerfstudio.evidence.point_samples import PointSamples, View, sample_points
+from ssa_nerfstudio.evidence.present_area import present_area
 from ssa_nerfstudio.evidence.scene_photos import scene_photos
 from ssa_nerfstudio.evidence.statistics import accumulate
 from ssa_nerfstudio.experiments.configuration import read
@@ -73,7 +74,7 @@ ESTIMATE = {
         "CLEAR_SHARE",
         "LIGHT_SHARE",
     ),
-    "initialization": ("CERTAIN_SHARE",),
+    "present_area": ("CERTAIN_SHARE",),
     "guided_upsampling": ("RADIUS",),
 }
 """Those of the modules that estimate the layers."""
@@ -187,7 +188,8 @@ def _measure(path: Path, variants: list[tuple[str, float]], held_out: bool) -> I
     def start(detection: Detection, refine: bool = True) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
         samples = sample_points(points, views, guide)
         found = estimate(samples, guide, detection.opaque, detection.mask)
-        overlay = ScreenSpaceOverlay(*statistics.size, adds_light=found.adds_light())
+        light = found.adds_light(present_area(found.opacity(), detection.mask))
+        overlay = ScreenSpaceOverlay(*statistics.size, adds_light=light)
         initialize_from(overlay, found, guide, detection.mask)
         again = second_estimate(overlay, found, samples, guide, views, detection)
         if refine:

@@ -15,8 +15,9 @@ from ssa_nerfstudio.evidence.changing_area import changing_area, moving_parts
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.guided_upsampling import enlarged, local_mean, reduced, reduced_deviation, upsample
-from ssa_nerfstudio.evidence.layer_estimate import CERTAIN_OPACITY, MIN_OPACITY, LayerEstimate, estimate_layers
+from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate, estimate_layers
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed, working_reduction
+from ssa_nerfstudio.evidence.present_area import present_area
 from ssa_nerfstudio.evidence.static_area import connected_parts
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 from ssa_nerfstudio.overlay.layer import CONSTANT_INITIALIZATION, INITIAL_MATTE_RANGE, ScreenSpaceOverlay
@@ -24,9 +25,6 @@ from ssa_nerfstudio.overlay.resampling import smallest_matte
 
 STATISTICS_SCALE = 0.05
 """s of the paper: a standard deviation of s over the views gives an initial matte of 1 / e."""
-CERTAIN_SHARE = 0.05
-"""Share of a connected area that has to be above CERTAIN_OPACITY: of a film that errors make, a few pixels are. A soft
-spot, whose opacity falls like a Gaussian, has such a share from a peak of 0.32 on."""
 
 
 @torch.no_grad()
@@ -93,7 +91,7 @@ def initialize_from(
 ) -> None:
     """Initialize an overlay from estimated layers.
 
-    Pixels whose estimated opacity is noise (`_present`) start clear. The sparsity loss weighs a pixel by its
+    Pixels whose estimated opacity is noise (`present_area`) start clear. The sparsity loss weighs a pixel by its
     transmittance.
 
     Args:
@@ -107,7 +105,7 @@ def initialize_from(
     if overlay.adds_light:
         transmittance = torch.ones_like(transmittance)
     reduction = working_reduction(overlay.height, overlay.width)
-    present = _present(smallest_matte(transmittance, addition), static, reduction)
+    present = present_area(smallest_matte(transmittance, addition), static).to(transmittance)
     falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)
     layers = upsample(torch.cat([transmittance, addition], dim=-1), guide.to(addition) / falloff, reduction).clamp(0, 1)
     present = enlarged(present, overlay.height, overlay.width, reduction) > 0
@@ -159,28 +157,6 @@ def initialize_as(overlay: ScreenSpaceOverlay, layers: Tensor, likely: Tensor | 
 def guide_of(statistics: ImageStatistics) -> Tensor:
     """Mean and deviation of the photos [H, W, 4], float32: where they have edges, an artifact may have some."""
     return torch.cat([statistics.mean(), statistics.deviation()], dim=-1).float()
-
-
-def _present(opacity: Tensor, static: Tensor | None, reduction: int) -> Tensor:
-    """Where the estimated opacity [h, w, 1] is more than noise: 1, elsewhere 0, likewise.
-
-    Opacities below MIN_OPACITY are noise. A connected area of others may be, too: errors of the points' places and
-    colors make a film of what is hard to see. It counts if more than CERTAIN_SHARE of it is above CERTAIN_OPACITY, or
-    if it holds a static edge.
-
-    Args:
-        opacity: at the working resolution.
-        static: [H, W] bool, of the photos' size; None: nowhere.
-        reduction: photo pixels a working pixel.
-    """
-    area = connected_parts(opacity[..., 0] > MIN_OPACITY)[..., None]
-    edge = torch.zeros_like(opacity) if static is None else reduced(static.to(opacity)[..., None], reduction) > 0
-    values = torch.stack([torch.ones_like(opacity), opacity > CERTAIN_OPACITY, edge], dim=-1).reshape(-1, 3)
-    pixels, certain, edges = summed(area.flatten(), values, int(area.max()) + 1).unbind(-1)
-    kept = ((certain > CERTAIN_SHARE * pixels) | (edges > 0)).to(opacity)
-    kept[0] = 0
-    # A pixel wider, for the soft rim.
-    return nn.functional.max_pool2d(kept[area].permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
 
 
 def _mean_color(layers: Tensor) -> Tensor:

@@ -83,16 +83,19 @@ class LayerEstimate:
         opacity = smallest_matte(self.falloff * self.transmittance, self.falloff * self.addition)
         return float((opacity > CERTAIN_OPACITY).float().mean())
 
-    def adds_light(self) -> bool:
+    def adds_light(self, area: Tensor) -> bool:
         """Whether the artifact adds light and hides nothing.
 
         What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
         that is more than LIGHT_SHARE of the light of details, which a film of errors has not, and more than noise
         beside all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. All by
-        squares, where there is more than noise.
+        squares, where there is more than noise: a film of errors that hides little may well exceed it.
+
+        Args:
+            area: bool [h, w, 1], where the artifact is (`present_area`).
         """
         opacity, added = self.opacity(), self.addition.amax(dim=-1, keepdim=True)
-        present = opacity > MIN_OPACITY
+        present = area & (opacity > MIN_OPACITY)
         excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)[present]
         details = (added * (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0))[present]
         light = (excess * added[present].square()).sum()

@@ -25,6 +25,7 @@ from ssa_nerfstudio.evidence.initialization import estimate, guide_of, ignore_ch
 from ssa_nerfstudio.evidence.layer_estimate import MIN_SHARE
 from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light, second_estimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
+from ssa_nerfstudio.evidence.present_area import present_area
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import OracleOverlay, ScreenSpaceOverlay
 from ssa_nerfstudio.plugin.decisions import tell
@@ -205,7 +206,9 @@ def _learned_overlay(
             return None
         part.say(*_in_words(detection, share, part.name, known))
     if by_points and found is not None:
-        started = overlay(found.adds_light() if config.overlay_light == "auto" else light)
+        if config.overlay_light == "auto":
+            light = found.adds_light(present_area(found.opacity(), detection.mask))
+        started = overlay(light)
         initialize_from(started, found, guide, detection.mask)
         may_move = False
         if config.shading != "off" and part.gains is None:

@@ -18,11 +18,13 @@ from ssa_nerfstudio.evidence.layer_estimate import (
     estimate_layers,
 )
 from ssa_nerfstudio.evidence.point_samples import PointSamples
+from ssa_nerfstudio.evidence.present_area import present_area
 
 HEIGHT, WIDTH = 36, 48
 BRIGHTEST = 0.6
 """Of the scene, so that added light is not clipped."""
 NOWHERE = torch.zeros(HEIGHT, WIDTH, 1)
+EVERYWHERE = NOWHERE == 0
 
 
 def disc(softness: float = 0.1, radius: float = 0.5) -> Tensor:
@@ -82,7 +84,7 @@ def test_layers_come_out_without_an_edge_or_a_decision_of_kind(name: str) -> Non
     found = estimate_layers(*observe(transmittance, addition), NOWHERE, NOWHERE)
     assert (found.transmittance - transmittance).abs().mean() < 0.04
     assert (found.addition - addition).abs().mean() < 0.03
-    assert found.adds_light() == (name == "additive")
+    assert found.adds_light(present_area(found.opacity())) == (name == "additive")
     present = torch.maximum(1 - transmittance, addition.amax(dim=-1, keepdim=True)) > 0.3
     assert found.share() == pytest.approx(float(present.float().mean()), abs=0.03)
 
@@ -96,7 +98,7 @@ def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, c
     layers = LayerEstimate(
         1 - thumb, torch.maximum(text, color * thumb).expand(-1, -1, 3), torch.ones_like(thumb), 0 * thumb
     )
-    assert layers.adds_light() == adds
+    assert layers.adds_light(EVERYWHERE) == adds
 
 
 @pytest.mark.parametrize(("added", "dark", "adds"), [(0.4, 0, True), (0.25, 0, False), (1, 12, True), (1, 28, False)])
@@ -109,7 +111,21 @@ def test_light_is_added_from_a_third_of_the_light_on_and_beside_what_hides_littl
     transmittance = 1 - (1 - added) * text
     transmittance[:dark] = 0.7
     layers = LayerEstimate(transmittance, text.expand(-1, -1, 3), torch.ones_like(text), torch.zeros_like(text))
-    assert layers.adds_light() == adds
+    assert layers.adds_light(EVERYWHERE) == adds
+
+
+def test_a_film_of_errors_does_not_let_a_dark_panel_add_light() -> None:
+    """A plain black panel has no light at all, so that all light is the film's, which errors make elsewhere."""
+    generator = torch.Generator().manual_seed(0)
+    transmittance, addition = torch.ones(HEIGHT, WIDTH, 1), torch.zeros(HEIGHT, WIDTH, 3)
+    transmittance[-10:] = 0.4
+    addition[:20] = 0.08 + 0.1 * torch.rand(20, WIDTH, 1, generator=generator)
+    layers = LayerEstimate(transmittance, addition, torch.ones_like(transmittance), torch.zeros_like(transmittance))
+    assert layers.adds_light(EVERYWHERE)
+    area = present_area(layers.opacity())
+    assert area[-10:].all()
+    assert not area[:20].any()
+    assert not layers.adds_light(area)
 
 
 def test_points_that_are_never_seen_clearly_do_not_vouch_for_themselves() -> None:

@@ -12,6 +12,7 @@ from ssa_nerfstudio.evidence.detection import detect
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
 from ssa_nerfstudio.evidence.point_samples import View, sample_points
+from ssa_nerfstudio.evidence.present_area import present_area
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
@@ -234,7 +235,7 @@ def estimated(points: Tensor, images: np.ndarray, masks: list | None = None) -> 
         initialize_from(overlay, found, guide_of(statistics))
         assert all(torch.isfinite(parameter).all() for parameter in overlay.parameters())
     assert 0 <= found.share() <= 1
-    assert found.adds_light() in (False, True)
+    assert found.adds_light(present_area(found.opacity(), nowhere)) in (False, True)
     return found
 
 
