@@ -182,11 +182,12 @@ def _measure(path: Path, variants: list[tuple[str, float]], held_out: bool) -> I
         truth = torch.from_numpy(np.concatenate(parts, axis=-1))
     covered = (truth[..., 0] < 0.95) | (truth[..., 1:].amax(dim=-1) > 0.05)
 
-    distance = _distance_of_others(sample_points(points, views, guide), guide, plain) if held_out else None
+    whole = sample_points(points, views, guide, plain.opaque) if held_out else None
+    distance = None if whole is None else _distance_of_others(whole, guide, plain)
     second: dict[str, float] = {}  # what a second estimate would leave, beside the first
 
     def start(detection: Detection, refine: bool = True) -> tuple[Detection, LayerEstimate, ScreenSpaceOverlay]:
-        samples = sample_points(points, views, guide)
+        samples = sample_points(points, views, guide, detection.opaque)
         found = estimate(samples, guide, detection.opaque, detection.mask)
         light = found.adds_light(present_area(found.opacity(), detection.mask))
         overlay = ScreenSpaceOverlay(*statistics.size, adds_light=light)

@@ -26,33 +26,43 @@ RADIAL_MODES = 5
 
 
 @torch.no_grad()
-def estimate_falloff(samples: PointSamples) -> Tensor:
+def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Tensor:
     """Estimate the transmittance of a falloff by robust regression, with the points' colors and views' gains unknown.
 
     Args:
         samples: of the scene's points.
+        opaque: bool [h, w, 1]: pixels that show nothing of the scene, of which patches say nothing; None: none are.
 
     Returns:
         [h, w, 1] in (0, 1], of the working size: about 1 in the clearest CLEAR_SHARE of the frame, and 1 everywhere
         unless the falloff is significant.
     """
     height, width = samples.size
-    modes = _modes(height, width, samples.focal_ratio).to(samples.color.device)
-    radial = modes[:, :RADIAL_MODES]
-    found = _regression(samples, modes).square()
     nothing = samples.color.new_ones(height, width, 1)
-    if _chance(found) >= SIGNIFICANCE:
+    clear = torch.ones_like(nothing, dtype=torch.bool) if opaque is None else ~opaque.to(nothing.device)
+    clear = clear.flatten()
+    if clear.float().mean() < CLEAR_SHARE:
+        return nothing
+    modes = _modes(height, width, samples.focal_ratio, clear.cpu())
+    if modes is None:
+        return nothing
+    modes = modes.to(samples.color.device)
+    radial = modes[:, :RADIAL_MODES]
+    if _chance(_regression(samples, modes).square()) >= SIGNIFICANCE:
         return nothing
     # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
     log_transmittance = radial @ _regression(samples, radial)
-    clearest = log_transmittance.kthvalue(max(1, round((1 - CLEAR_SHARE) * height * width))).values
+    seen = log_transmittance[clear]
+    # Where nothing is seen the modes may be anything.
+    log_transmittance = log_transmittance.clamp(seen.min(), seen.max())
+    clearest = seen.kthvalue(max(1, round((1 - CLEAR_SHARE) * len(seen)))).values
     # A lens darkens from the middle outwards, and the farther out the faster. A logo in the middle does not: outside of
     # it nothing changes any more.
-    middle, halfway, corner = (log_transmittance[y * width + x] for y, x in _ways_out(height, width))
-    if middle < clearest or middle - halfway > halfway - corner:
+    middle, halfway, outside = log_transmittance[_ways_out(height, width, samples.focal_ratio, clear)]
+    if middle < clearest or middle - halfway > halfway - outside:
         return nothing
-    clear = log_transmittance[log_transmittance >= clearest].mean()
-    return (log_transmittance - clear).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+    clear_mean = seen[seen >= clearest].mean()
+    return (log_transmittance - clear_mean).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
 def _chance(squares: Tensor) -> float:
@@ -62,25 +72,36 @@ def _chance(squares: Tensor) -> float:
     return float(fdtrc(RADIAL_MODES, len(squares) - RADIAL_MODES, ratio))
 
 
-def _ways_out(height: int, width: int) -> list[tuple[int, int]]:
-    """Pixels in the middle of the frame, halfway to its last corner, and there: y and x."""
-    middle = height // 2, width // 2
-    corner = height - 1, width - 1
-    return [middle, ((middle[0] + corner[0]) // 2, (middle[1] + corner[1]) // 2), corner]
+def _ways_out(height: int, width: int, focal_ratio: float, clear: Tensor) -> Tensor:
+    """Indices [3] of the pixels in the middle of the frame, halfway out, and the farthest of those that are clear."""
+    radius = _places(height, width, focal_ratio).abs().to(clear.device)
+    farthest = torch.where(clear, radius, -1).argmax()
+    return torch.stack([radius.argmin(), (radius - radius[farthest] / 2).abs().argmin(), farthest])
 
 
-def _modes(height: int, width: int, focal_ratio: float) -> Tensor:
-    """Polynomials of the position, orthonormal over the frame [h w, 17], float64: r^2 to r^10 and all others up to the
-    fourth degree. x is divided by the ratio of focal lengths, so that r is proportional to the tangent of the angle to
-    the lens's axis: undistorted photos may be stretched."""
+def _places(height: int, width: int, focal_ratio: float) -> Tensor:
+    """Of the pixels, x + i y from the frame's center in units of its longer side, complex128 [h w]. x is divided by the
+    ratio of focal lengths, so that the absolute value is proportional to the tangent of the angle to the lens's axis:
+    undistorted photos may be stretched."""
     y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
-    z = torch.complex(*torch.broadcast_tensors(x / focal_ratio, y[:, None])).flatten() / max(height, width)
+    return torch.complex(*torch.broadcast_tensors(x / focal_ratio, y[:, None])).flatten() / max(height, width)
+
+
+def _modes(height: int, width: int, focal_ratio: float, clear: Tensor) -> Tensor | None:
+    """Polynomials of the position [h w, 17], float64, orthonormal over the clear pixels [h w]: r^2 to r^10 and all
+    others up to the fourth degree. None where these pixels do not tell them apart, as in tiny frames."""
+    z = _places(height, width, focal_ratio)
     squared = z.abs().square()
     turning = [z, z**2, z * squared, z**3, z**2 * squared, z**4]
     radial = [squared**power for power in range(1, RADIAL_MODES + 1)]
     modes = [*radial, *(part for mode in turning for part in (mode.real, mode.imag))]
     stacked = torch.stack(modes, dim=-1)
-    return torch.linalg.qr(stacked - stacked.mean(dim=0)).Q
+    stacked -= stacked[clear].mean(dim=0)
+    R = torch.linalg.qr(stacked[clear]).R
+    scale = R.diagonal().abs()
+    if len(R) < len(modes) or scale.min() < 1e-12 * scale.max():
+        return None
+    return torch.linalg.solve_triangular(R, stacked, upper=True, left=False)
 
 
 def _regression(samples: PointSamples, modes: Tensor) -> Tensor:

@@ -74,7 +74,7 @@ def estimate(
     areas = torch.stack([hidden, static.to(guide.device)], dim=-1).to(guide)
     mean, deviation = reduced(guide[..., :3], reduction), reduced_deviation(guide[..., 3:], reduction)
     photos = torch.cat([mean, deviation, reduced(areas, reduction)], dim=-1).to(samples.color.device)
-    falloff = estimate_falloff(samples) if falloff is None else falloff
+    falloff = estimate_falloff(samples, photos[..., 4:5] > 0) if falloff is None else falloff
     if (falloff < 1).any():
         photos[..., :4] /= falloff
         samples = replace(samples, color=samples.color / falloff.reshape(-1, 1)[samples.pixel]).ordered()

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from itertools import accumulate
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from ssa_nerfstudio.evidence import brightness
+from ssa_nerfstudio.evidence.box_means import box_means, patch_means, read_boxes
 from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS, nearest_depths
 from ssa_nerfstudio.evidence.statistics import FULL_SCALE, GRAY_LEVEL, UNKNOWN_DEVIATION
 
@@ -65,7 +66,8 @@ class PointSamples:
     view: Tensor
     """[S] int64: index of the view."""
     patch: Tensor | None = None
-    """[S, 3]: mean color around the point, over a footprint of constant size in the scene; None: not read."""
+    """[S, 3]: mean color around the point, over a footprint of constant size in the scene, NaN where all of it is known
+    to be opaque; None: not read."""
     focal_ratio: float = 1.0
     """Mean focal length of the views along x by that along y, both in pixels: a circle around the lens's axis is this
     many times as wide as it is high."""
@@ -99,7 +101,9 @@ def working_reduction(height: int, width: int) -> int:
     return max(1, min(round(max(height, width) / WORKING_SIZE), height, width))
 
 
-def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = None) -> PointSamples:
+def sample_points(
+    points: Tensor, views: Sequence[View], guide: Tensor | None = None, opaque: Tensor | None = None
+) -> PointSamples:
     """Project points into every view, drop those that nearer ones hide, and read the photo there.
 
     A photo is read where the point is, through a box as large as a working pixel. Read in the working pixel around it,
@@ -118,6 +122,8 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
         views: of one size, at least one.
         guide: M and D of the photos, [H, W, 4], see `initialization.guide_of`; where D is unknown, and without a guide,
             samples are left as they are read. Without one, patches are not read.
+        opaque: [H, W] bool, pixels that show nothing of the scene (`Detection.opaque`): patches leave out what holds
+            any; None: there are none.
 
     Returns:
         The samples, on the points' device.
@@ -129,8 +135,11 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
     if guide is not None:
         guide = guide.to(points.device)
         unknown = guide[..., 3:] == UNKNOWN_DEVIATION
-        guide = _boxes(torch.cat([guide, unknown], dim=-1), reduction)
+        guide = box_means(torch.cat([guide, unknown], dim=-1), reduction)
         of_pixels = guide[::reduction, ::reduction].reshape(-1, 5)
+    clear = None
+    if opaque is not None and opaque.any():
+        clear = (box_means(opaque.to(points.device)[..., None], reduction)[::reduction, ::reduction] == 0).float()
     seen = visible(points, views, reduction, size)
     farthest = seen.depth.new_zeros(len(points)).scatter_reduce(0, seen.point, seen.depth, "amax")
     footprint = (2 * OCCLUSION_RADIUS + 1) * farthest[seen.point] / seen.depth
@@ -147,22 +156,26 @@ def sample_points(points: Tensor, views: Sequence[View], guide: Tensor | None = 
             everywhere = torch.ones(height, width)
             masks = [everywhere if each.mask is None else each.mask.reshape(height, width) != 0 for each in some]
             shown = torch.stack([mask.to(points.device, torch.bool) for mask in masks])[..., None]
-            images, unmasked = torch.where(shown, images, 0), _boxes(shown, reduction)
+            images, unmasked = torch.where(shown, images, 0), box_means(shown, reduction)
             inside = unmasked[:, ::reduction, ::reduction].reshape(len(some), -1)[view, pixel] == 1
-            inside &= _read(unmasked, view, position, reduction)[:, 0] > 1 - GRAY_LEVEL
+            inside &= read_boxes(unmasked, view, position, reduction)[:, 0] > 1 - GRAY_LEVEL
         kept.append(inside)
-        boxes = _boxes(images, reduction)
-        colors.append(_read(boxes, view, position, reduction))
+        boxes = box_means(images, reduction)
+        colors.append(read_boxes(boxes, view, position, reduction))
         if guide is not None:
-            boxes = boxes if unmasked is None else torch.cat([boxes, unmasked], dim=-1)
-            patch = _patch_means(boxes[:, ::reduction, ::reduction], view, pixel, side)
-            patches.append(patch if unmasked is None else patch[:, :3] / patch[:, 3:])
+            weighed = unmasked is not None or clear is not None
+            weight = torch.ones_like(boxes[..., :1]) if unmasked is None else unmasked
+            boxes = (torch.cat([boxes, weight], dim=-1) if weighed else boxes)[:, ::reduction, ::reduction]
+            patch = patch_means(boxes if clear is None else boxes * clear, view, pixel, side)
+            # Sums are exact only within rounding.
+            patches.append(patch[:, :3] / patch[:, 3:].where(patch[:, 3:] > 1e-6, torch.nan) if weighed else patch)
     same = torch.ones(3, device=points.device)
     gains = torch.stack([same if view.gain is None else view.gain.to(same) for view in views])
     white = gains * gains.new_tensor([[FULL_SCALE.get(view.image.dtype, 1.0)] for view in views])
     color, patch = torch.cat(colors) / white[seen.view], None
     if guide is not None:
-        here, there = of_pixels[seen.pixel], _read(guide[None], torch.zeros_like(seen.view), seen.position, reduction)
+        here = of_pixels[seen.pixel]
+        there = read_boxes(guide[None], torch.zeros_like(seen.view), seen.position, reduction)
         color = torch.where(here[:, 4:] + there[:, 4:] > 0, color, _matched(color, here, there))
         color = color.clamp_min(0).minimum(1 / gains[seen.view])
         patch = torch.cat(patches) / white[seen.view]
@@ -233,48 +246,6 @@ def _matched(color: Tensor, here: Tensor, there: Tensor) -> Tensor:
     # A gray level, because photos are rounded.
     ratio = (here[:, 3:4] + GRAY_LEVEL) / (there[:, 3:4] + GRAY_LEVEL)
     return here[:, :3] + (color - there[:, :3]) * ratio
-
-
-def _boxes(images: Tensor, side: int) -> Tensor:
-    """Means [..., H - side + 1, W - side + 1, C] of images [..., H, W, C] over all squares of this side."""
-    means = images.float()
-    for dim in (-3, -2):
-        length = means.shape[dim] - side + 1
-        rows = means.narrow(dim, 0, length).clone()
-        for shift in range(1, side):
-            rows += means.narrow(dim, shift, length)
-        means = rows / side
-    return means
-
-
-def _read(boxes: Tensor, view: Tensor, position: Tensor, side: int) -> Tensor:
-    """Means [M, C] over the boxes around x, y [M, 2], moved into the frame; between pixels by bilinear interpolation.
-
-    Args:
-        boxes: of V views, see `_boxes`.
-        view: [M], whose.
-        position: in the photo, pixels.
-        side: of the boxes.
-    """
-    height, width = boxes.shape[1:3]
-    corner = torch.minimum((position - side / 2).clamp_min(0), position.new_tensor([width - 1, height - 1]))
-    (left, top), (x, y) = corner.long().unbind(dim=-1), corner.frac().to(boxes)[..., None].unbind(dim=1)
-    right, bottom = (left + 1).clamp_max(width - 1), (top + 1).clamp_max(height - 1)
-    upper, lower = (boxes[view, row, left].lerp(boxes[view, row, right], x) for row in (top, bottom))
-    return upper.lerp(lower, y)
-
-
-def _patch_means(images: Tensor, view: Tensor, pixel: Tensor, side: Tensor) -> Tensor:
-    """Means [M, C] of images [V, h, w, C] of views [M] over squares of sides [M] around pixels [M], in the frame."""
-    height, width = images.shape[1:3]
-    sums = nn.functional.pad(images.double().cumsum(1).cumsum(2), (0, 0, 1, 0, 1, 0))
-    place = torch.stack([pixel % width, pixel // width], dim=-1)
-    side = side[:, None].round().clamp_max(2 * max(height, width))
-    first = (place + 0.5 - side / 2).round().long()
-    last = (first + side.long()).minimum(place.new_tensor([width, height]))
-    (left, top), (right, bottom) = first.clamp_min(0).unbind(dim=-1), last.unbind(dim=-1)
-    total = sums[view, bottom, right] - sums[view, top, right] - sums[view, bottom, left] + sums[view, top, left]
-    return (total / ((right - left) * (bottom - top))[:, None]).float()
 
 
 def visible(points: Tensor, views: Sequence[View], reduction: int, size: tuple[int, int]) -> Sights:

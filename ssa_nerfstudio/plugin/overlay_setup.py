@@ -195,7 +195,7 @@ def _learned_overlay(
     found = None
     if points is not None and (config.overlay == "auto" or by_points):
         device, views = part.images[0]["image"].device, views_of(part.images, part.cameras, part.gains)
-        samples = sample_points(points.to(device), views, guide)
+        samples = sample_points(points.to(device), views, guide, detection.opaque)
         found = estimate(samples, guide, detection.opaque, detection.mask) if len(samples.point) else None
     if config.overlay == "auto":
         share = 0.0 if found is None else found.share()

@@ -97,6 +97,38 @@ def test_what_is_not_radial_or_not_darkest_outside_is_no_falloff(name: str) -> N
     assert (estimate_falloff(samples(NOT_RADIAL[name])) == 1).all()
 
 
+def behind_bars(transmittance: Tensor, outside: Tensor) -> tuple[PointSamples, Tensor]:
+    """Samples whose frame is black outside, and where it is; their patches leave that out."""
+    whole = samples(transmittance)
+    black = outside.flatten()[whole.pixel, None]
+    color = torch.where(black, 0.05, whole.color)
+    return replace(whole, color=color, patch=torch.where(black, torch.nan, color)), outside[..., None]
+
+
+def test_black_bars_beside_the_frame_are_no_falloff() -> None:
+    """A circle, which is as round as a lens, and bars, beyond which nothing is seen."""
+    for outside in (torch.hypot(X, Y) > 0.65, X.abs() > 0.45, X.abs().maximum(Y.abs()) > 0.4):
+        seen, opaque = behind_bars(torch.ones(HEIGHT, WIDTH), outside)
+        assert (estimate_falloff(seen, opaque) == 1).all()
+    seen, opaque = behind_bars(torch.ones(HEIGHT, WIDTH), torch.hypot(X, Y) > 0.65)
+    assert estimate_falloff(replace(seen, patch=None)).min() < 0.5, "as it used to be"
+
+
+@pytest.mark.parametrize("outside", [X.abs() > 0.6, torch.hypot(X, Y) > 0.75], ids=["bars", "circle"])
+def test_a_falloff_between_black_bars_is_found_and_goes_no_further(outside: Tensor) -> None:
+    found = estimate_falloff(*behind_bars(FALLOFF, outside))[..., 0]
+    inside = FALLOFF[~outside]
+    clearest = inside[inside >= inside.quantile(0.8)].log().mean().exp()
+    assert ((found - (FALLOFF / clearest).clamp_max(1)).abs()[~outside]).max() < 0.05
+    assert found.min() == found[~outside].min()
+
+
+def test_what_is_hidden_nearly_everywhere_has_no_falloff() -> None:
+    seen, _ = behind_bars(FALLOFF, X.abs() > 0.1)
+    for opaque in ((X.abs() > 0.1)[..., None], torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)):
+        assert (estimate_falloff(seen, opaque) == 1).all()
+
+
 def test_samples_that_say_nothing_find_nothing() -> None:
     every = samples(FALLOFF)
     assert (estimate_falloff(replace(every, color=torch.ones_like(every.color))) == 1).all()

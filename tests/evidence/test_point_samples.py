@@ -198,6 +198,29 @@ def test_patches_are_means_over_squares_that_end_at_the_frame_and_at_masks(
             torch.testing.assert_close(samples.patch[at], expected if number else expected / gain)
 
 
+def test_patches_leave_out_what_is_opaque() -> None:
+    """A bar covers the left half: beside it a patch is of the scene alone, and in the middle of it of nothing."""
+    image = torch.rand(40, 60, 3, generator=torch.Generator().manual_seed(0))
+    opaque = torch.zeros(40, 60, dtype=torch.bool)
+    opaque[:, :30] = True
+    place = torch.tensor([[31, 20], [50, 20], [8, 20]])
+    points = torch.cat([(place + 0.5 - torch.tensor([30.0, 20.0])) / 40, torch.ones(3, 1)], dim=-1) * 2
+    mask = torch.ones(40, 60)
+    mask[18] = 0
+    for seen_by in (None, mask):
+        views = [View(image, seen_by, torch.eye(4), K)] * 2
+        plain, beside = (sample_points(points, views, UNKNOWN[:40, :60], bar) for bar in (None, opaque))
+        torch.testing.assert_close(beside.color, plain.color, rtol=0, atol=0)
+        assert beside.patch is not None
+        assert plain.patch is not None
+        rows = slice(18 if seen_by is None else 19, 23)
+        first, second, third = (beside.patch[beside.point == number] for number in range(3))
+        torch.testing.assert_close(first, image[rows, 30:34].mean(dim=(0, 1)).expand(2, 3))
+        torch.testing.assert_close(second, plain.patch[plain.point == 1])
+        assert third.isnan().all()
+        assert not plain.patch.isnan().any()
+
+
 def test_what_a_mask_hides_is_never_read() -> None:
     """Not even where it is no number."""
     image, mask = torch.full((540, 960, 3), 0.75), torch.ones(540, 960, dtype=torch.bool)
