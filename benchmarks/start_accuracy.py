@@ -29,7 +29,6 @@ from ssa_nerfstudio.data.transforms import Transforms
 from ssa_nerfstudio.errors import InputError
 from ssa_nerfstudio.evidence.artifact_light import ArtifactLight, artifact_light
 from ssa_nerfstudio.evidence.detection import Detection, detect
-from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import OUTLIER_SCALE, LayerEstimate
 from ssa_nerfstudio.evidence.mean_light import refine_in_mean_light, second_estimate
@@ -250,7 +249,7 @@ def _distance_of_others(samples: PointSamples, guide: torch.Tensor, detection: D
     They are those of whole photos, of points that others show, too. The first estimate predicts them. What all photos
     say together is of these, too: mean and deviation, the detected area, the falloff.
     """
-    falloff = estimate_falloff(samples)
+    falloff = estimate(samples, guide, detection.opaque, detection.mask).falloff
     away = samples.view % FOLDS == 0
     parts = {name: getattr(samples, name)[~away] for name in ("point", "pixel", "color", "view")}
     kept = replace(samples, **parts, patch=None)

@@ -61,7 +61,7 @@ class Command:
         dataset = Dataset.read(self.data, 8, 1)
         self.output.mkdir(parents=True, exist_ok=True)
         for name in self.shapes:
-            folder = self.output / f"{self.data.name}-{name}"
+            folder = self.output / f"{dataset.root.resolve().name}-{name}"
             if not folder.exists():
                 simulate(dataset, Scene(((name, Drawn(name)),)), folder, 2)
             print(folder)

@@ -48,10 +48,10 @@ def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Ten
         return nothing
     modes = modes.to(samples.color.device)
     radial = modes[:, :RADIAL_MODES]
-    if _chance(_regression(samples, modes).square()) >= SIGNIFICANCE:
+    if _chance(_regression(samples, modes, clear).square()) >= SIGNIFICANCE:
         return nothing
     # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
-    log_transmittance = radial @ _regression(samples, radial)
+    log_transmittance = radial @ _regression(samples, radial, clear)
     seen = log_transmittance[clear]
     # Where nothing is seen the modes may be anything.
     log_transmittance = log_transmittance.clamp(seen.min(), seen.max())
@@ -104,12 +104,13 @@ def _modes(height: int, width: int, focal_ratio: float, clear: Tensor) -> Tensor
     return torch.linalg.solve_triangular(R, stacked, upper=True, left=False)
 
 
-def _regression(samples: PointSamples, modes: Tensor) -> Tensor:
-    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, g of views, with Cauchy's weights."""
+def _regression(samples: PointSamples, modes: Tensor, clear: Tensor) -> Tensor:
+    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, g of views, with Cauchy's weights, from the
+    samples at clear pixels [h w]: at others a patch may be of what is beside, but modes are extrapolated."""
     # Of patches, because a point's own color changes with its distance.
     color = samples.color if samples.patch is None else samples.patch
     brightness, every = color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
-    usable = (brightness < USABLE[1]) & (samples.view % every == 0)
+    usable = clear[samples.pixel] & (brightness < USABLE[1]) & (samples.view % every == 0)
     usable &= samples.point % (int(usable.sum()) // MAX_SAMPLES + 1) == 0
     if not usable.any():
         return modes.new_zeros(modes.shape[1])

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from ssa_nerfstudio.evidence import falloff
 from ssa_nerfstudio.evidence.falloff import estimate_falloff
 from ssa_nerfstudio.evidence.point_samples import PointSamples
 
@@ -121,6 +122,24 @@ def test_a_falloff_between_black_bars_is_found_and_goes_no_further(outside: Tens
     clearest = inside[inside >= inside.quantile(0.8)].log().mean().exp()
     assert ((found - (FALLOFF / clearest).clamp_max(1)).abs()[~outside]).max() < 0.05
     assert found.min() == found[~outside].min()
+
+
+def test_modes_are_orthonormal_over_what_is_seen() -> None:
+    """Only then does the test compare squares of one variance."""
+    clear = (X.abs() < 0.5).flatten()
+    modes = falloff._modes(HEIGHT, WIDTH, 1.1, clear)
+    assert modes is not None
+    torch.testing.assert_close(modes[clear].T @ modes[clear], torch.eye(17).double(), rtol=0, atol=1e-9)
+    assert modes[clear].mean(dim=0).abs().max() < 1e-9
+    assert falloff._modes(HEIGHT, WIDTH, 1.1, torch.arange(HEIGHT * WIDTH) < 2 * WIDTH) is None, "two rows"
+
+
+def test_samples_at_opaque_pixels_do_not_count_though_their_patches_reach_beyond() -> None:
+    outside = X.abs() > 0.5
+    seen, opaque = behind_bars(FALLOFF, outside)
+    assert seen.patch is not None
+    wrong = replace(seen, patch=torch.where(outside.flatten()[seen.pixel, None], 0.9, seen.patch))
+    torch.testing.assert_close(estimate_falloff(wrong, opaque), estimate_falloff(seen, opaque))
 
 
 def test_what_is_hidden_nearly_everywhere_has_no_falloff() -> None:

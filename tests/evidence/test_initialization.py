@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from ssa_nerfstudio.evidence.initialization import guide_of, initialize, initialize_from
+from ssa_nerfstudio.evidence import initialization
+from ssa_nerfstudio.evidence.initialization import estimate, guide_of, initialize, initialize_from
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
+from ssa_nerfstudio.evidence.point_samples import PointSamples
 from ssa_nerfstudio.evidence.statistics import ImageStatistics, accumulate
 from ssa_nerfstudio.overlay.layer import ScreenSpaceOverlay
 
@@ -239,3 +241,21 @@ def test_a_falloff_multiplies_what_is_behind_it_and_is_kept_where_that_is_noise(
     torch.testing.assert_close(overlay.evidence[:, 10:], torch.ones(12, 6, 1), atol=1e-5, rtol=0)
     assert behind.share() == 0.5
     assert replace(behind, falloff=torch.full_like(falloff, 0.6)).share() == 1
+
+
+def test_a_falloff_is_looked_for_beside_what_is_opaque(monkeypatch) -> None:
+    """A working pixel of which any part is opaque counts as such."""
+    asked: list[torch.Tensor] = []
+
+    def spy(samples: PointSamples, opaque: torch.Tensor) -> torch.Tensor:
+        asked.append(opaque)
+        return torch.ones(160, 240, 1)
+
+    monkeypatch.setattr(initialization, "estimate_falloff", spy)
+    opaque, guide = torch.zeros(320, 480, dtype=torch.bool), torch.rand(320, 480, 4)
+    opaque[:, 101:300] = True
+    one = torch.zeros(1, dtype=torch.int64)
+    samples = PointSamples(one, one, torch.full((1, 3), 0.5), 1, (160, 240), one)
+    estimate(samples, guide, opaque, torch.zeros_like(opaque))
+    columns = torch.arange(240)
+    assert torch.equal(asked[0][..., 0], ((columns >= 50) & (columns < 150)).expand(160, 240))

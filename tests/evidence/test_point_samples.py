@@ -221,6 +221,23 @@ def test_patches_leave_out_what_is_opaque() -> None:
         assert not plain.patch.isnan().any()
 
 
+def test_patches_leave_out_working_pixels_that_hold_anything_opaque() -> None:
+    """Two pixels to a working pixel, of which a bar cuts one; in the middle of it rounding leaves no patch."""
+    image = torch.rand(320, 480, 3, generator=torch.Generator().manual_seed(0))
+    opaque = torch.zeros(320, 480, dtype=torch.bool)
+    opaque[:, 101:300] = True
+    lens = torch.tensor([[300.0, 0.0, 240.0], [0.0, 300.0, 160.0], [0.0, 0.0, 1.0]])
+    place = torch.tensor([[97.0, 161.0], [201.0, 161.0]])
+    points = torch.cat([(place - torch.tensor([240.0, 160.0])) / 300, torch.ones(2, 1)], dim=-1) * 2
+    samples = sample_points(points, [View(image, None, torch.eye(4), lens)] * 2, UNKNOWN[:320, :480], opaque)
+    assert samples.patch is not None
+    assert samples.size == (160, 240)
+    beside, inside = (samples.patch[samples.point == number] for number in range(2))
+    # Five working pixels around 48: 46 to 49, because the bar begins in 50.
+    torch.testing.assert_close(beside, image[156:166, 92:100].mean(dim=(0, 1)).expand(2, 3))
+    assert inside.isnan().all()
+
+
 def test_what_a_mask_hides_is_never_read() -> None:
     """Not even where it is no number."""
     image, mask = torch.full((540, 960, 3), 0.75), torch.ones(540, 960, dtype=torch.bool)

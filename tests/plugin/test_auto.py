@@ -238,3 +238,32 @@ def test_the_start_is_told_where_detection_has_found_something(tiny_scene, tmp_p
     configure_training("ssa-splatfacto", tiny_scene, tmp_path, 1, {}).pipeline.setup(device="cpu")
     (static,) = told
     assert static.float().mean() > 0.1
+
+
+def test_the_start_reads_samples_and_light_by_what_was_detected(tiny_scene, tmp_path, configure_training, monkeypatch):
+    """What is opaque is left out of patches, and a film of errors does not decide about additive light."""
+    detections: list[Detection] = []
+    opaque: list[torch.Tensor | None] = []
+    areas: list[torch.Tensor] = []
+    detect, sample, adds_light = overlay_setup.detect, overlay_setup.sample_points, LayerEstimate.adds_light
+
+    def detected(*arguments: Any, **options: Any) -> Detection:
+        detections.append(detect(*arguments, **options))
+        return detections[-1]
+
+    def sampled(points: torch.Tensor, views: Any, guide: torch.Tensor, known: torch.Tensor) -> Any:
+        opaque.append(known)
+        return sample(points, views, guide, known)
+
+    def decided(found: LayerEstimate, area: torch.Tensor) -> bool:
+        areas.append(area == overlay_setup.present_area(found.opacity(), detections[-1].mask))
+        return adds_light(found, area)
+
+    monkeypatch.setattr(overlay_setup, "detect", detected)
+    monkeypatch.setattr(overlay_setup, "sample_points", sampled)
+    monkeypatch.setattr(LayerEstimate, "adds_light", decided)
+    config = configure_training("ssa-splatfacto", tiny_scene, tmp_path, 10, {"overlay": "on"})
+    config.pipeline.setup(device="cpu", test_mode="val", world_size=1, local_rank=0)
+    assert opaque[0] is detections[0].opaque
+    assert len(areas) == 1
+    assert areas[0].all()
