@@ -68,7 +68,7 @@ class Command:
 
 
 def _shape(draw: Shape) -> Shape:
-    SHAPES[draw.__name__.strip("_").replace("_", "-")] = draw
+    SHAPES[draw.__name__.replace("_", "-")] = draw
     return draw
 
 

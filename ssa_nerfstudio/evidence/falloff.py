@@ -39,8 +39,8 @@ def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Ten
     """
     height, width = samples.size
     nothing = samples.color.new_ones(height, width, 1)
-    clear = torch.ones_like(nothing, dtype=torch.bool) if opaque is None else ~opaque.to(nothing.device)
-    clear = clear.flatten()
+    shown = torch.ones_like(nothing, dtype=torch.bool) if opaque is None else ~opaque.to(nothing.device)
+    clear = shown.flatten()
     if clear.float().mean() < CLEAR_SHARE:
         return nothing
     modes = _modes(height, width, samples.focal_ratio, clear.cpu())
@@ -61,8 +61,8 @@ def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Ten
     middle, halfway, outside = log_transmittance[_ways_out(height, width, samples.focal_ratio, clear)]
     if middle < clearest or middle - halfway > halfway - outside:
         return nothing
-    clear_mean = seen[seen >= clearest].mean()
-    return (log_transmittance - clear_mean).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+    unity = seen[seen >= clearest].mean()
+    return (log_transmittance - unity).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
 def _chance(squares: Tensor) -> float:

@@ -182,8 +182,8 @@ def _in_hull(gaps: Tensor, places: Tensor) -> Tensor:
     rows, columns = places.cpu().unbind(dim=-1)
     height = int(rows.max()) + 1
     filled = (torch.bincount(rows, minlength=height) > 0).nonzero()[:, 0]
-    columns_of = columns.new_zeros(height)
-    ends = [columns_of.scatter_reduce(0, rows, columns, end, include_self=False) for end in ("amin", "amax")]
+    unset = columns.new_zeros(height)
+    ends = [unset.scatter_reduce(0, rows, columns, end, include_self=False) for end in ("amin", "amax")]
     outline = torch.cat([torch.stack([filled, end[filled]], dim=-1) for end in ends])
     try:
         sides = torch.from_numpy(ConvexHull(outline.numpy()).equations)
