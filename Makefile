@@ -26,11 +26,16 @@ PYTEST := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --d
 
 .PHONY: setup demo docs test slow mutants stability lint bare format clean
 
+# Makes an environment where there is none: $(call environment,FOLDER)
+define environment
+	@test -n "$(PYTHON)" || { echo "error: no Python 3.10, 3.11 or 3.12 found; install one or call make PYTHON=/path/to/python3.11" >&2; exit 2; }
+	@test -x $(1)/bin/python || $(PYTHON) -m venv $(1) || { rm -rf $(1); echo "error: $(PYTHON) cannot make environments; install its venv package (Debian: apt install python3-venv)" >&2; exit 2; }
+endef
+
 setup: $(READY)
 
 $(READY): pyproject.toml Makefile
-	@test -n "$(PYTHON)" || { echo "error: no Python 3.10, 3.11 or 3.12 found; install one or call make PYTHON=/path/to/python3.11" >&2; exit 2; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV) || { rm -rf $(VENV); echo "error: $(PYTHON) cannot make environments; install its venv package (Debian: apt install python3-venv)" >&2; exit 2; }
+	$(call environment,$(VENV))
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	PYTHONWARNINGS=ignore $(BIN)/python -m pip install --quiet --editable '.[dev]'
 	$(BIN)/python -m ssa_nerfstudio.plugin.compat.open3d_libraries
@@ -62,11 +67,11 @@ lint: $(READY)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
 # Installs the wheel's requirements alone, and takes a capture from photos to exports with them.
-bare: $(READY)
-	$(BIN)/python tests/bare_install/make_capture.py $(BARE)/capture
-	test -x $(BARE)/bin/python || $(PYTHON) -m venv $(BARE)
+bare:
+	$(call environment,$(BARE))
 	PYTHONWARNINGS=ignore $(BARE)/bin/python -m pip install --quiet --upgrade pip .
 	$(BARE)/bin/python -m ssa_nerfstudio.plugin.compat.open3d_libraries
+	$(BARE)/bin/python tests/bare_install/make_capture.py $(BARE)/capture
 	$(BARE)/bin/python tests/bare_install/check.py $(BARE)/capture
 
 format: $(READY)

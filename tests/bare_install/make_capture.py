@@ -1,4 +1,7 @@
-"""Write a small capture for `check.py`, which has no experiments to make one: `make_capture.py FOLDER`."""
+"""Write a small capture for `check.py`: `make_capture.py FOLDER`.
+
+Imports of the experiments only what needs none of their packages, so that the bare environment can run it.
+"""
 
 from __future__ import annotations
 
