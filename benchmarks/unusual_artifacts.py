@@ -114,6 +114,22 @@ def black_circle(height: int, width: int, rng: np.random.Generator) -> Layers:
 
 
 @_shape
+def elliptical_vignette(height: int, width: int, rng: np.random.Generator) -> Layers:
+    """As photo editors darken corners: by the way to the corner in units of the frame's sides."""
+    x, y = _places(height, width)
+    s = ((math.sqrt(2) * np.hypot(x - 0.5, y - 0.5) - 0.25) / 0.75).clip(0, 1)
+    return _hiding(0.75 * s**2 * (3 - 2 * s), (0, 0, 0))
+
+
+@_shape
+def dark_frame(height: int, width: int, rng: np.random.Generator) -> Layers:
+    """Soft, with round corners."""
+    x, y = _places(height, width)
+    s = ((2 * ((x - 0.5) ** 4 + (y - 0.5) ** 4) ** 0.25 - 0.6) / 0.4).clip(0, 1)
+    return _hiding(0.8 * s, (0, 0, 0))
+
+
+@_shape
 def fade_below(height: int, width: int, rng: np.random.Generator) -> Layers:
     return _hiding(0.85 * ((_places(height, width)[1] - 0.65) / 0.35).clip(0, 1), (0, 0, 0))
 

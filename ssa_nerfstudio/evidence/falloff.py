@@ -1,15 +1,17 @@
 """Falloff of light from the middle of the frame to its corners (vignetting), from the scene's points.
 
 A point has one color in all photos, so where log I changes with its pixel, something in front changes. A lens darkens
-by the angle to its axis alone, which is taken to be in the frame's center. Shading, reflections and other artifacts
-have no reason to: what of the same smoothness is not radial says how much of the radial part may be theirs.
-docs/method.md derives it.
+by the angle to its axis alone, which is taken to be in the frame's center, and a photo editor by the place between
+center and sides. Shading, reflections and other artifacts have no reason to do either: what of the same smoothness is
+not radial says how much of the radial part may be theirs. docs/method.md derives it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from scipy.special import fdtrc
+from scipy.special import fdtrc, stdtrit
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
@@ -19,10 +21,11 @@ from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 MAX_SAMPLES = 20_000
-"""Of more, those of a regular subset of the points are used: a falloff has five parameters."""
+"""Of more, those of a regular subset of the points are used: a falloff has five or six parameters."""
 MAX_VIEWS = 128
 """Of more, a regular subset is used."""
 RADIAL_MODES = 5
+"""Of a lens; a photo editor has one more."""
 
 
 @torch.no_grad()
@@ -43,65 +46,104 @@ def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Ten
     clear = shown.flatten()
     if clear.float().mean() < CLEAR_SHARE:
         return nothing
-    modes = _modes(height, width, samples.focal_ratio, clear.cpu())
-    if modes is None:
+    # Round in front of the lens, or as wide and as high as the frame and rounder or squarer than an ellipse.
+    hypotheses = ((samples.focal_ratio, RADIAL_MODES), (width / height, RADIAL_MODES + 1))
+    tests = [test for stretch, count in hypotheses if (test := _test(samples, clear, stretch, count))]
+    best = min(tests, key=lambda test: test.chance, default=None)
+    # Bonferroni's correction: that one of two is significant is twice as likely.
+    if best is None or len(tests) * best.chance >= SIGNIFICANCE:
         return nothing
-    modes = modes.to(samples.color.device)
-    radial = modes[:, :RADIAL_MODES]
-    if _chance(_regression(samples, modes, clear).square()) >= SIGNIFICANCE:
-        return nothing
-    # By itself: in a capture whose points move along few paths, the other modes take part of the falloff.
-    log_transmittance = radial @ _regression(samples, radial, clear)
+    # By themselves: in a capture whose points move along few paths, the other modes take part of the falloff.
+    coefficients = _regression(samples, best.modes, clear)
+    log_transmittance = best.modes @ coefficients
     seen = log_transmittance[clear]
     # Where nothing is seen the modes may be anything.
     log_transmittance = log_transmittance.clamp(seen.min(), seen.max())
-    clearest = seen.kthvalue(max(1, round((1 - CLEAR_SHARE) * len(seen)))).values
-    # A lens darkens from the middle outwards, and the farther out the faster. A logo in the middle does not: outside of
-    # it nothing changes any more.
-    middle, halfway, outside = log_transmittance[_ways_out(height, width, samples.focal_ratio, clear)]
-    if middle < clearest or middle - halfway > halfway - outside:
+    clearest = seen.kthvalue(max(1, round((1 - CLEAR_SHARE) * len(seen))))
+    if not best.darkens_outwards(coefficients, log_transmittance, clear, clear.nonzero()[clearest.indices, 0]):
         return nothing
-    unity = seen[seen >= clearest].mean()
+    unity = seen[seen >= clearest.values].mean()
     return (log_transmittance - unity).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
-def _chance(squares: Tensor) -> float:
-    """Probability that radial modes have as large a share of these squares [K] if all have one variance (F-test)."""
-    others = squares[RADIAL_MODES:].mean()
-    ratio = float(squares[:RADIAL_MODES].mean() / others) if others > 0 else 0.0
-    return float(fdtrc(RADIAL_MODES, len(squares) - RADIAL_MODES, ratio))
+@dataclass(frozen=True)
+class _Test:
+    """Whether log I changes with the modes of a falloff more than with others of the same smoothness."""
+
+    modes: Tensor
+    """Of the falloff, [h w, K], orthonormal over the clear pixels."""
+    radius: Tensor
+    """Way of the pixels [h w] from the frame's center, in any unit."""
+    chance: float
+    """Probability of as large a ratio of mean squares if all coefficients have one variance (F-test)."""
+    error: Tensor
+    """Standard error of a coefficient []: root mean square of the other modes'."""
+    others: int
+    """Number of them: degrees of freedom of the standard error."""
+
+    def darkens_outwards(
+        self, coefficients: Tensor, log_transmittance: Tensor, clear: Tensor, clearest: Tensor
+    ) -> bool:
+        """Whether it darkens from the middle outwards, and the farther out the faster.
+
+        A logo in the middle does not: outside of it nothing changes any more.
+
+        Args:
+            coefficients: of the modes, [K].
+            log_transmittance: of the pixels, [h w].
+            clear: bool [h w], pixels that show the scene.
+            clearest: index [] of the least transparent of those that count as clear.
+        """
+        farthest = torch.where(clear, self.radius, -1).argmax()
+        middle, halfway = self.radius.argmin(), (self.radius - self.radius[farthest] / 2).abs().argmin()
+        # A flat middle is never quite flat: by chance, and as polynomials of a finite degree ripple. What the last one
+        # adds is about what others would.
+        ways = self.modes[middle] - self.modes[clearest]
+        by_chance = float(stdtrit(self.others, 1 - SIGNIFICANCE)) * self.error * ways.norm()
+        by_degree = coefficients[RADIAL_MODES - 1] * ways[RADIAL_MODES - 1]
+        darker = log_transmittance[clearest] - log_transmittance[middle] > torch.hypot(by_chance, by_degree)
+        faster = log_transmittance[farthest] < 2 * log_transmittance[halfway] - log_transmittance[middle]
+        return bool(faster & ~darker)
 
 
-def _ways_out(height: int, width: int, focal_ratio: float, clear: Tensor) -> Tensor:
-    """Indices [3] of the pixels in the middle of the frame, halfway out, and the farthest of those that are clear."""
-    radius = _places(height, width, focal_ratio).abs().to(clear.device)
-    farthest = torch.where(clear, radius, -1).argmax()
-    return torch.stack([radius.argmin(), (radius - radius[farthest] / 2).abs().argmin(), farthest])
-
-
-def _places(height: int, width: int, focal_ratio: float) -> Tensor:
-    """Of the pixels, x + i y from the frame's center in units of its longer side, complex128 [h w]. x is divided by the
-    ratio of focal lengths, so that the absolute value is proportional to the tangent of the angle to the lens's axis:
-    undistorted photos may be stretched."""
-    y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
-    return torch.complex(*torch.broadcast_tensors(x / focal_ratio, y[:, None])).flatten() / max(height, width)
-
-
-def _modes(height: int, width: int, focal_ratio: float, clear: Tensor) -> Tensor | None:
-    """Polynomials of the position [h w, 17], float64, orthonormal over the clear pixels [h w]: r^2 to r^10 and all
-    others up to the fourth degree. None where these pixels do not tell them apart, as in tiny frames."""
-    z = _places(height, width, focal_ratio)
-    squared = z.abs().square()
-    turning = [z, z**2, z * squared, z**3, z**2 * squared, z**4]
-    radial = [squared**power for power in range(1, RADIAL_MODES + 1)]
-    modes = [*radial, *(part for mode in turning for part in (mode.real, mode.imag))]
-    stacked = torch.stack(modes, dim=-1)
-    stacked -= stacked[clear].mean(dim=0)
-    R = torch.linalg.qr(stacked[clear]).R
-    scale = R.diagonal().abs()
-    if len(R) < len(modes) or scale.min() < 1e-12 * scale.max():
+def _test(samples: PointSamples, clear: Tensor, stretch: float, count: int) -> _Test | None:
+    """Test the first `count` modes; None where the clear pixels do not tell them apart."""
+    modes = _modes(*samples.size, stretch, clear)
+    if modes is None:
         return None
-    return torch.linalg.solve_triangular(R, stacked, upper=True, left=False)
+    squares = _regression(samples, modes, clear).square()
+    others = squares[count:]
+    ratio = squares[:count].mean() / others.mean().clamp_min(torch.finfo(others.dtype).tiny)
+    radius = _places(*samples.size, stretch).abs().to(modes.device)
+    chance = float(fdtrc(count, len(others), float(ratio)))
+    return _Test(modes[:, :count], radius, chance, others.mean().sqrt(), len(others))
+
+
+def _places(height: int, width: int, stretch: float) -> Tensor:
+    """Of the pixels, x / stretch + i y from the frame's center in units of its longer side, complex128 [h w].
+
+    With the ratio of focal lengths for a stretch, the absolute value is proportional to the tangent of the angle to the
+    lens's axis: undistorted photos may be stretched. With the frame's, it is the same in the middles of all its sides.
+    """
+    y, x = (torch.arange(side, dtype=torch.float64) + 0.5 - side / 2 for side in (height, width))
+    return torch.complex(*torch.broadcast_tensors(x / stretch, y[:, None])).flatten() / max(height, width)
+
+
+def _modes(height: int, width: int, stretch: float, clear: Tensor) -> Tensor | None:
+    """Polynomials of the position [h w, 17], float64, orthonormal over the clear pixels [h w]: r^2 to r^10, r^4 times
+    the cosine of four times the angle, and all others up to the fourth degree. None where these pixels do not tell them
+    apart, as in tiny frames."""
+    z = _places(height, width, stretch)
+    squared, seen = z.abs().square(), clear.cpu()
+    radial = [squared**power for power in range(1, RADIAL_MODES + 1)]
+    turning = [part for mode in (z, z**2, z * squared, z**3, z**2 * squared) for part in (mode.real, mode.imag)]
+    stacked = torch.stack([*radial, (z**4).real, (z**4).imag, *turning], dim=-1)
+    stacked -= stacked[seen].mean(dim=0)
+    R = torch.linalg.qr(stacked[seen]).R
+    scale = R.diagonal().abs()
+    if len(R) < stacked.shape[1] or scale.min() < 1e-12 * scale.max():
+        return None
+    return torch.linalg.solve_triangular(R, stacked, upper=True, left=False).to(clear.device)
 
 
 def _regression(samples: PointSamples, modes: Tensor, clear: Tensor) -> Tensor:
