@@ -54,9 +54,9 @@ DETECTION = {
         "MAX_DISPLACED_SHARES",
         "MIN_STILL_SHARE",
     ),
-    "null_distribution": ("MAX_SHIFT",),
-    "static_area": ("MAX_OPAQUE_DEVIATION", "OUTLINE_SIGNIFICANCE"),
-    "detection": ("SIGNIFICANCE", "MIN_OPAQUE_COVERAGE"),
+    "null_distribution": ("SIGNIFICANCE", "MAX_SHIFT"),
+    "static_area": ("MAX_OPAQUE_DEVIATION",),
+    "detection": ("MIN_OPAQUE_COVERAGE",),
 }
 """Constants of the modules in `evidence` that detect, which comes first."""
 ESTIMATE = {

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ssa_nerfstudio.evidence.detection import DRAWS, MIN_VIEWS, SIGNIFICANCE
+from ssa_nerfstudio.evidence.detection import DRAWS, MIN_VIEWS
 from ssa_nerfstudio.evidence.displacement import displaced_share
 from ssa_nerfstudio.evidence.edge_evidence import (
     COARSE_FACTOR,
@@ -26,7 +26,7 @@ from ssa_nerfstudio.evidence.edge_evidence import (
     block_images,
     gradient_moments,
 )
-from ssa_nerfstudio.evidence.null_distribution import MAX_SHIFT, VALUES_AT_ONCE
+from ssa_nerfstudio.evidence.null_distribution import MAX_SHIFT, SIGNIFICANCE, VALUES_AT_ONCE
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 MIN_CHANGED_SHARE = 2 * MIN_EDGE_SHARES[0]

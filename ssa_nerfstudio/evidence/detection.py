@@ -13,14 +13,12 @@ import torch
 from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import MIN_EDGE_SHARES, measure_edges
-from ssa_nerfstudio.evidence.null_distribution import clopper_pearson, null_shares
+from ssa_nerfstudio.evidence.null_distribution import SIGNIFICANCE, clopper_pearson, null_shares
 from ssa_nerfstudio.evidence.static_area import artifact_area
 from ssa_nerfstudio.evidence.statistics import ImageStatistics
 
 DRAWS = 200
 """Shifted captures in the null distribution."""
-SIGNIFICANCE = 0.01
-"""Largest p-value that is reported as an artifact."""
 MIN_VIEWS = 6
 """With fewer views than this, standard errors mean nothing and nothing is reported."""
 MIN_OPAQUE_COVERAGE = 0.25

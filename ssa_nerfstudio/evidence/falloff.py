@@ -14,8 +14,8 @@ import torch
 from scipy.special import fdtrc, stdtrit
 from torch import Tensor
 
-from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
 from ssa_nerfstudio.evidence.layer_estimate import CLEAR_SHARE, OUTLIER_SCALE, robust_deviation
+from ssa_nerfstudio.evidence.null_distribution import SIGNIFICANCE
 from ssa_nerfstudio.evidence.photo_exposure import DAMPING, ROUNDS, USABLE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL

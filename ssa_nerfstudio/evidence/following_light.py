@@ -12,10 +12,10 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.artifact_light import HIDING
 from ssa_nerfstudio.evidence.changing_area import large_parts
-from ssa_nerfstudio.evidence.detection import SIGNIFICANCE
 from ssa_nerfstudio.evidence.expected_layers import DETAIL_RADIUS
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.layer_estimate import LayerEstimate
+from ssa_nerfstudio.evidence.null_distribution import SIGNIFICANCE
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
 from ssa_nerfstudio.evidence.scene_photos import MAX_VIEWS
 from ssa_nerfstudio.evidence.static_area import connected_parts

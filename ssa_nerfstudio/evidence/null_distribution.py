@@ -15,6 +15,9 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence, edge_shares, evidence_field
 
+SIGNIFICANCE = 0.01
+"""Largest probability by chance of what is reported: an artifact, an outline, a falloff, a change over time or with the
+scene's light."""
 MAX_SHIFT = 16
 """Blocks are shifted by up to this many working pixels in each direction, in steps of COARSE_FACTOR."""
 VALUES_AT_ONCE = 2**22

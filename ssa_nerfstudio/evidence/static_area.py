@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.edge_evidence import COARSE_FACTOR, EdgeEvidence
 from ssa_nerfstudio.evidence.guided_upsampling import reduced_deviation
+from ssa_nerfstudio.evidence.null_distribution import SIGNIFICANCE
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL, ImageStatistics
 
 MAX_OPAQUE_DEVIATION = 0.2
@@ -21,8 +22,6 @@ area relative to what surrounds it. On three captures dashboards and buttons hav
 paths and skies between drops at least 0.45."""
 MIN_AREA = COARSE_FACTOR**2
 """Working pixels; smaller areas than a pixel of the coarse scale are ignored."""
-OUTLINE_SIGNIFICANCE = 0.01
-"""An area is enclosed if its edges have at most this probability by chance. The level of detection, too."""
 _NEIGHBORS = np.ones((3, 3), np.uint8)
 _MARGIN = 4
 _OUTLINE_WIDTH = 5
@@ -99,12 +98,12 @@ def _has_outline(outlines: np.ndarray, area: np.ndarray, usual: float) -> bool:
     edges = outlines[around] > 0
     if edges.mean() < 0.5:
         return False
-    if _tail(edges.sum() / _OUTLINE_WIDTH, len(edges) / _OUTLINE_WIDTH, usual) < OUTLINE_SIGNIFICANCE:
+    if _tail(edges.sum() / _OUTLINE_WIDTH, len(edges) / _OUTLINE_WIDTH, usual) < SIGNIFICANCE:
         return True
     plain = outlines[cv2.erode(area, _NEIGHBORS, iterations=_OUTLINE_WIDTH) > 0] == 0
     without, places = plain.sum() / _OUTLINE_WIDTH**2, len(plain) / _OUTLINE_WIDTH**2
     often = without >= 2 * (1 - usual) * places
-    return bool(often and _tail(without, places, 1 - usual) < OUTLINE_SIGNIFICANCE)
+    return bool(often and _tail(without, places, 1 - usual) < SIGNIFICANCE)
 
 
 def _tail(found: float, places: float, probability: float) -> float:
