@@ -91,8 +91,8 @@ def initialize_from(
 ) -> None:
     """Initialize an overlay from estimated layers.
 
-    Pixels whose estimated opacity is noise (`present_area`) start clear. The sparsity loss weighs a pixel by its
-    transmittance.
+    Pixels whose estimated opacity is noise (`present_area`) start clear, and where an artifact adds light, it hides
+    the scene only where it hides most of it. The sparsity loss weighs a pixel by its transmittance.
 
     Args:
         overlay: changed in place.
@@ -103,7 +103,7 @@ def initialize_from(
     """
     transmittance, addition = estimate.transmittance, estimate.addition
     if overlay.adds_light:
-        transmittance = torch.ones_like(transmittance)
+        transmittance = torch.where(estimate.hides(), transmittance, 1.0)
     reduction = working_reduction(overlay.height, overlay.width)
     present = present_area(smallest_matte(transmittance, addition), static).to(transmittance)
     falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)

@@ -19,6 +19,7 @@ from ssa_nerfstudio.evidence.first_colors import first_colors
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
+from ssa_nerfstudio.evidence.static_area import connected_parts
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
@@ -83,24 +84,32 @@ class LayerEstimate:
         opacity = smallest_matte(self.falloff * self.transmittance, self.falloff * self.addition)
         return float((opacity > CERTAIN_OPACITY).float().mean())
 
+    def hides(self) -> Tensor:
+        """Where the artifact hides more of the scene than it shows, bool [h, w, 1]: connected areas of MIN_SHARE of the
+        frame, because smaller ones may be errors of the layers."""
+        part = connected_parts(self.transmittance[..., 0] < 0.5)
+        large = part.flatten().bincount() >= MIN_SHARE * part.numel()
+        large[0] = False
+        return large[part][..., None]
+
     def adds_light(self, area: Tensor) -> bool:
-        """Whether the artifact adds light and hides nothing.
+        """Whether the artifact adds light: not what hides (`hides`), as a dashboard behind rain, but the rest of it.
 
         What hides at most replaces the scene's light by its own, B <= 1 - T. Light that exceeds it is added; true if
         that is more than LIGHT_SHARE of the light of details, which a film of errors has not, and more than noise
-        beside all that is hidden: bright text beside a black thumb is no reason to let the thumb add light. All by
-        squares, where there is more than noise: a film of errors that hides little may well exceed it.
+        beside all that is not clear: a few drops are no reason to let mud add light. All by squares, where there is
+        more than noise: a film of errors that hides little may well exceed it.
 
         Args:
             area: bool [h, w, 1], where the artifact is (`present_area`).
         """
         opacity, added = self.opacity(), self.addition.amax(dim=-1, keepdim=True)
-        present = area & (opacity > MIN_OPACITY)
-        excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)[present]
-        details = (added * (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0))[present]
-        light = (excess * added[present].square()).sum()
+        shown = area & (opacity > MIN_OPACITY) & ~self.hides()
+        excess = (1 - (1 - self.transmittance) / added.clamp_min(1e-6)).clamp(0, 1)[shown]
+        details = (added * (added - local_mean(added, DETAIL_RADIUS)).clamp_min(0))[shown]
+        light = (excess * added[shown].square()).sum()
         mostly = (excess * details).sum() > LIGHT_SHARE * details.sum()
-        return bool(mostly & (light > MIN_OPACITY**2 * opacity[present].square().sum()))
+        return bool(mostly & (light > MIN_OPACITY**2 * opacity[shown].square().sum()))
 
 
 @torch.no_grad()

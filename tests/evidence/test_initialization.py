@@ -209,13 +209,27 @@ def test_a_rim_that_would_be_noise_by_itself_is_kept_for_a_pixel() -> None:
     assert matte[34] < 0.011
 
 
-def test_what_hides_without_adding_light_starts_clear_in_additive_light() -> None:
-    """It hides nothing, so errors of T are no reason to take weak light for more than noise."""
+@pytest.mark.parametrize(("transmittance", "hides"), [(0.6, False), (0.4, True), (0.05, True)])
+def test_additive_light_hides_the_scene_where_it_hides_most_of_it(transmittance: float, hides: bool) -> None:
+    """A dashboard behind rain does. Elsewhere errors of T are no reason to take weak light for more than noise."""
     layers = estimated(12, 40, 0.1, (0.3, 0.1, 0.1))
-    layers.transmittance[:, 26:36], layers.addition[:, 26:36] = 0.4, 0.08
+    layers.transmittance[:, 26:36], layers.addition[:, 26:36] = transmittance, 0.08
     overlay = ScreenSpaceOverlay(12, 40, adds_light=True)
     initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
-    assert overlay.layers()[1][:, 27:35].max() < 0.02
+    found, added = (layer[:, 27:35] for layer in overlay.layers())
+    torch.testing.assert_close(found, torch.full_like(found, transmittance if hides else 0.99))
+    torch.testing.assert_close(overlay.evidence[:, 27:35], torch.full_like(found, transmittance if hides else 1.0))
+    assert ((added - 0.08).abs().max() < 0.01) if hides else (added.max() < 0.02)
+
+
+@pytest.mark.parametrize(("pixels", "hides"), [(9, False), (10, True)])
+def test_additive_light_hides_no_area_that_may_be_an_error(pixels: int, hides: bool) -> None:
+    """A fiftieth of 480 pixels may be."""
+    layers = estimated(12, 40, 1.0, (0.0, 0.0, 0.0))
+    layers.transmittance[5, 26 : 26 + pixels] = 0.1
+    overlay = ScreenSpaceOverlay(12, 40, adds_light=True)
+    initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
+    assert bool((overlay.matte() > 0.5).any()) == hides
 
 
 def test_additive_light_starts_without_a_matte() -> None:

@@ -89,8 +89,8 @@ def test_layers_come_out_without_an_edge_or_a_decision_of_kind(name: str) -> Non
     assert found.share() == pytest.approx(float(present.float().mean()), abs=0.03)
 
 
-@pytest.mark.parametrize(("hidden", "color", "adds"), [(0.0, 0.1, True), (0.9, 0.1, False), (0.9, 0.01, False)])
-def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, color: float, adds: bool) -> None:
+@pytest.mark.parametrize(("hidden", "color"), [(0.0, 0.1), (0.9, 0.1), (0.9, 0.01)])
+def test_bright_details_beside_what_hides_add_light_and_that_still_hides(hidden: float, color: float) -> None:
     """Text of which too few points are seen to tell what it hides, alone and beside a soft, dark thumb."""
     thumb = hidden * disc()
     text = torch.zeros(HEIGHT, WIDTH, 1)
@@ -98,7 +98,8 @@ def test_bright_details_beside_what_hides_are_no_additive_light(hidden: float, c
     layers = LayerEstimate(
         1 - thumb, torch.maximum(text, color * thumb).expand(-1, -1, 3), torch.ones_like(thumb), 0 * thumb
     )
-    assert layers.adds_light(EVERYWHERE) == adds
+    assert layers.adds_light(EVERYWHERE)
+    assert torch.equal(layers.hides(), thumb > 0.5)
 
 
 @pytest.mark.parametrize(("added", "dark", "adds"), [(0.4, 0, True), (0.25, 0, False), (1, 12, True), (1, 28, False)])
@@ -112,6 +113,17 @@ def test_light_is_added_from_a_third_of_the_light_on_and_beside_what_hides_littl
     transmittance[:dark] = 0.7
     layers = LayerEstimate(transmittance, text.expand(-1, -1, 3), torch.ones_like(text), torch.zeros_like(text))
     assert layers.adds_light(EVERYWHERE) == adds
+
+
+@pytest.mark.parametrize("rain", [False, True])
+def test_drops_add_light_beside_a_dashboard_whose_bright_gauges_do_not(rain: bool) -> None:
+    generator = torch.Generator().manual_seed(0)
+    transmittance, addition = torch.ones(HEIGHT, WIDTH, 1), torch.zeros(HEIGHT, WIDTH, 3)
+    addition[:-12] = 0.4 * rain * (torch.rand(HEIGHT - 12, WIDTH, 1, generator=generator) < 0.2)
+    transmittance[-12:], addition[-12:] = 0.02, 0.2
+    addition[-12:, ::4] = 0.9
+    layers = LayerEstimate(transmittance, addition, torch.ones_like(transmittance), torch.zeros_like(transmittance))
+    assert layers.adds_light(EVERYWHERE) == rain
 
 
 def test_a_film_of_errors_does_not_let_a_dark_panel_add_light() -> None:
