@@ -130,6 +130,13 @@ def dark_frame(height: int, width: int, rng: np.random.Generator) -> Layers:
 
 
 @_shape
+def corner_panels(height: int, width: int, rng: np.random.Generator) -> Layers:
+    """Translucent, as of a game."""
+    x, y = _places(height, width)
+    return _hiding(0.5 * ((abs(x - 0.5) > 0.28) & (abs(y - 0.5) > 0.28)).astype(float), (0.3, 0.3, 0.3))
+
+
+@_shape
 def fade_below(height: int, width: int, rng: np.random.Generator) -> Layers:
     return _hiding(0.85 * ((_places(height, width)[1] - 0.65) / 0.35).clip(0, 1), (0, 0, 0))
 

@@ -1,9 +1,9 @@
 """Falloff of light from the middle of the frame to its corners (vignetting), from the scene's points.
 
 A point has one color in all photos, so where log I changes with its pixel, something in front changes. A lens darkens
-by the angle to its axis alone, which is taken to be in the frame's center, and a photo editor by the place between
-center and sides. Shading, reflections and other artifacts have no reason to do either: what of the same smoothness is
-not radial says how much of the radial part may be theirs. docs/method.md derives it.
+by the angle to its axis alone, which is taken to be in the frame's center, and a photo editor by the distance from the
+center in units of the frame's sides. Shading, reflections and other artifacts have no reason to do either: what of the
+same smoothness is not radial says how much of the radial part may be theirs. docs/method.md derives it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ MAX_SAMPLES = 20_000
 MAX_VIEWS = 128
 """Of more, a regular subset is used."""
 RADIAL_MODES = 5
-"""Of a lens; a photo editor has one more."""
+"""r^2 to r^10. A photo editor's falloff may have one mode more, which makes it squarer."""
 
 
 @torch.no_grad()
@@ -46,24 +46,16 @@ def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Ten
     clear = shown.flatten()
     if clear.float().mean() < CLEAR_SHARE:
         return nothing
-    # Round in front of the lens, or as wide and as high as the frame and rounder or squarer than an ellipse.
-    hypotheses = ((samples.focal_ratio, RADIAL_MODES), (width / height, RADIAL_MODES + 1))
-    tests = [test for stretch, count in hypotheses if (test := _test(samples, clear, stretch, count))]
-    best = min(tests, key=lambda test: test.chance, default=None)
+    # Round in front of the lens, or as wide and as high as the frame.
+    tests = [_test(samples, clear, stretch) for stretch in dict.fromkeys((samples.focal_ratio, width / height))]
+    likeliest = min((test for test in tests if test is not None), key=lambda test: test.chance, default=None)
     # Bonferroni's correction: that one of two is significant is twice as likely.
-    if best is None or len(tests) * best.chance >= SIGNIFICANCE:
+    if likeliest is None or len(tests) * likeliest.chance >= SIGNIFICANCE:
         return nothing
-    # By themselves: in a capture whose points move along few paths, the other modes take part of the falloff.
-    coefficients = _regression(samples, best.modes, clear)
-    log_transmittance = best.modes @ coefficients
-    seen = log_transmittance[clear]
-    # Where nothing is seen the modes may be anything.
-    log_transmittance = log_transmittance.clamp(seen.min(), seen.max())
-    clearest = seen.kthvalue(max(1, round((1 - CLEAR_SHARE) * len(seen))))
-    if not best.darkens_outwards(coefficients, log_transmittance, clear, clear.nonzero()[clearest.indices, 0]):
+    log_transmittance = likeliest.log_transmittance(samples, clear)
+    if log_transmittance is None:
         return nothing
-    unity = seen[seen >= clearest.values].mean()
-    return (log_transmittance - unity).exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+    return log_transmittance.exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
 
 
 @dataclass(frozen=True)
@@ -72,51 +64,68 @@ class _Test:
 
     modes: Tensor
     """Of the falloff, [h w, K], orthonormal over the clear pixels."""
-    radius: Tensor
-    """Way of the pixels [h w] from the frame's center, in any unit."""
+    places: Tensor
+    """Of the pixels, see `_places`."""
     chance: float
     """Probability of as large a ratio of mean squares if all coefficients have one variance (F-test)."""
     error: Tensor
     """Standard error of a coefficient []: root mean square of the other modes'."""
-    others: int
-    """Number of them: degrees of freedom of the standard error."""
+    freedom: int
+    """Number of the other modes."""
 
-    def darkens_outwards(
-        self, coefficients: Tensor, log_transmittance: Tensor, clear: Tensor, clearest: Tensor
-    ) -> bool:
-        """Whether it darkens from the middle outwards, and the farther out the faster.
+    def log_transmittance(self, samples: PointSamples, clear: Tensor) -> Tensor | None:
+        """Fit the modes by themselves: [h w], 0 on the mean of the clearest of the clear pixels [h w].
 
-        A logo in the middle does not: outside of it nothing changes any more.
+        In a capture whose points move along few paths, the other modes take part of the falloff.
 
-        Args:
-            coefficients: of the modes, [K].
-            log_transmittance: of the pixels, [h w].
-            clear: bool [h w], pixels that show the scene.
-            clearest: index [] of the least transparent of those that count as clear.
+        Returns:
+            None unless it darkens from the middle outwards, and the farther out the faster. A logo in the middle does
+            not: outside of it nothing changes any more.
         """
-        farthest = torch.where(clear, self.radius, -1).argmax()
-        middle, halfway = self.radius.argmin(), (self.radius - self.radius[farthest] / 2).abs().argmin()
-        # A flat middle is never quite flat: by chance, and as polynomials of a finite degree ripple. What the last one
-        # adds is about what others would.
-        ways = self.modes[middle] - self.modes[clearest]
-        by_chance = float(stdtrit(self.others, 1 - SIGNIFICANCE)) * self.error * ways.norm()
+        coefficients = _regression(samples, self.modes, clear)
+        fitted = self.modes @ coefficients
+        seen = fitted[clear]
+        # Where nothing is seen the modes may be anything.
+        fitted = fitted.clamp(seen.min(), seen.max())
+        rank = max(1, round((1 - CLEAR_SHARE) * len(seen)))
+        least_clear = clear.nonzero()[seen.kthvalue(rank).indices, 0]
+        farthest = torch.where(clear, self.places.abs(), -1).argmax()
+        middle, halfway = self.places.abs().argmin(), (self.places - self.places[farthest] / 2).abs().argmin()
+        # A flat middle is never quite flat: by chance, and as polynomials of a finite degree ripple. What r^10 adds is
+        # about what higher powers would.
+        ways = self.modes[middle] - self.modes[least_clear]
+        by_chance = float(stdtrit(self.freedom, 1 - SIGNIFICANCE)) * self.error * ways.norm()
         by_degree = coefficients[RADIAL_MODES - 1] * ways[RADIAL_MODES - 1]
-        darker = log_transmittance[clearest] - log_transmittance[middle] > torch.hypot(by_chance, by_degree)
-        faster = log_transmittance[farthest] < 2 * log_transmittance[halfway] - log_transmittance[middle]
-        return bool(faster & ~darker)
+        darker = fitted[least_clear] - fitted[middle] > torch.hypot(by_chance, by_degree)
+        faster = fitted[farthest] < 2 * fitted[halfway] - fitted[middle]
+        return fitted - seen[seen >= fitted[least_clear]].mean() if faster & ~darker else None
 
 
-def _test(samples: PointSamples, clear: Tensor, stretch: float, count: int) -> _Test | None:
-    """Test the first `count` modes; None where the clear pixels do not tell them apart."""
-    modes = _modes(*samples.size, stretch, clear)
+def _test(samples: PointSamples, clear: Tensor, stretch: float) -> _Test | None:
+    """Test the modes that are radial where x is divided by `stretch`; None where clear pixels do not tell them apart.
+
+    As wide and as high as the frame, a falloff may be squarer than an ellipse. What changes with the corners as much as
+    with the radius, and so is less square, is none: four panels in the corners.
+    """
+    height, width = samples.size
+    modes = _modes(height, width, stretch, clear)
     if modes is None:
         return None
-    squares = _regression(samples, modes, clear).square()
-    others = squares[count:]
-    ratio = squares[:count].mean() / others.mean().clamp_min(torch.finfo(others.dtype).tiny)
-    radius = _places(*samples.size, stretch).abs().to(modes.device)
-    chance = float(fdtrc(count, len(others), float(ratio)))
-    return _Test(modes[:, :count], radius, chance, others.mean().sqrt(), len(others))
+    coefficients = _regression(samples, modes, clear)
+    squarer = stretch == width / height and bool(coefficients[RADIAL_MODES] < 0)
+    count = RADIAL_MODES + 1 if squarer else RADIAL_MODES
+    chance = _chance(coefficients[:count], coefficients[count:])
+    if not squarer and coefficients[RADIAL_MODES] > coefficients[:count].square().mean().sqrt():
+        chance = 1.0
+    error, freedom = coefficients[count:].square().mean().sqrt(), len(coefficients) - count
+    places = _places(height, width, stretch).to(modes.device)
+    return _Test(modes[:, :count], places, chance, error, freedom)
+
+
+def _chance(those: Tensor, others: Tensor) -> float:
+    """Probability of as large a ratio of mean squares of coefficients if all have one variance (F-test)."""
+    variance = others.square().mean().clamp_min(torch.finfo(others.dtype).tiny)
+    return float(fdtrc(len(those), len(others), float(those.square().mean() / variance)))
 
 
 def _places(height: int, width: int, stretch: float) -> Tensor:
@@ -140,10 +149,11 @@ def _modes(height: int, width: int, stretch: float, clear: Tensor) -> Tensor | N
     stacked = torch.stack([*radial, (z**4).real, (z**4).imag, *turning], dim=-1)
     stacked -= stacked[seen].mean(dim=0)
     R = torch.linalg.qr(stacked[seen]).R
-    scale = R.diagonal().abs()
-    if len(R) < stacked.shape[1] or scale.min() < 1e-12 * scale.max():
+    scale = R.diagonal()
+    if len(R) < stacked.shape[1] or scale.abs().min() < 1e-12 * scale.abs().max():
         return None
-    return torch.linalg.solve_triangular(R, stacked, upper=True, left=False).to(clear.device)
+    modes = torch.linalg.solve_triangular(R, stacked, upper=True, left=False)
+    return (modes * scale.sign()).to(clear.device)  # of the polynomials' own sign
 
 
 def _regression(samples: PointSamples, modes: Tensor, clear: Tensor) -> Tensor:

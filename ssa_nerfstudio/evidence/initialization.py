@@ -103,7 +103,9 @@ def initialize_from(
     """
     transmittance, addition = estimate.transmittance, estimate.addition
     if overlay.adds_light:
-        transmittance = torch.where(estimate.hides(), transmittance, 1.0)
+        # And a pixel around, for the soft rim.
+        hides = nn.functional.max_pool2d(estimate.hides().to(transmittance).permute(2, 0, 1), 3, 1, 1).permute(1, 2, 0)
+        transmittance = torch.where(hides > 0, transmittance, 1.0)
     reduction = working_reduction(overlay.height, overlay.width)
     present = present_area(smallest_matte(transmittance, addition), static).to(transmittance)
     falloff = enlarged(estimate.falloff, overlay.height, overlay.width, reduction)

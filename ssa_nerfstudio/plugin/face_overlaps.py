@@ -62,8 +62,8 @@ def joined_overlays(
         own, others = known.get(face, clear), [(other, layers) for other, layers in known.items() if other != face]
         beside = hidden_by_neighbors(face, others)
         if ((beside[..., 0] < HIDDEN) & (own[..., 0] >= HIDDEN)).sum() >= smallest:
-            # Without additive light: it hides the scene.
-            joined[number] = ScreenSpaceOverlay(face.size, face.size, resolution)
+            adds_light = overlay is not None and overlay.adds_light
+            joined[number] = ScreenSpaceOverlay(face.size, face.size, resolution, adds_light)
             both = np.where(beside[..., :1] < own[..., :1], beside, own)
             initialize_as(joined[number], torch.from_numpy(both))
             for name in OPTIONAL_BUFFERS if overlay is not None else ():

@@ -222,6 +222,17 @@ def test_additive_light_hides_the_scene_where_it_hides_most_of_it(transmittance:
     assert ((added - 0.08).abs().max() < 0.01) if hides else (added.max() < 0.02)
 
 
+def test_the_rim_of_what_hides_beside_additive_light_is_kept_for_a_pixel() -> None:
+    layers = estimated(12, 40, 1.0, (0.0, 0.0, 0.0))
+    layers.transmittance[:, 26:32], layers.transmittance[:, 32:35] = 0.1, 0.7
+    overlay = ScreenSpaceOverlay(12, 40, adds_light=True)
+    initialize_from(overlay, layers, guide_of(capture(12, 40)[1]))
+    matte = overlay.matte()[6, :, 0]
+    assert matte[31] > 0.8
+    assert 0.2 < matte[32] < 0.4
+    assert matte[34] < 0.011
+
+
 @pytest.mark.parametrize(("pixels", "hides"), [(9, False), (10, True)])
 def test_additive_light_hides_no_area_that_may_be_an_error(pixels: int, hides: bool) -> None:
     """A fiftieth of 480 pixels may be."""

@@ -54,6 +54,27 @@ def test_what_reaches_over_the_border_of_a_face_starts_in_its_neighbors():
         assert transmittance[clear].mean() > 0.98
 
 
+def test_drops_on_a_face_add_light_beside_what_reaches_over_from_its_neighbor():
+    size = FACES[0].size
+    front = FACES.index(next(each for each in FACES if each.name == "front"))
+    rain = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(size, size, 1)
+    rain[::5, ::5, 1:] = 0.5
+    own = ScreenSpaceOverlay(size, size, adds_light=True)
+    initialize_as(own, rain)
+    overlays = [own if face is FACES[front] else None for face in FACES]
+    down = next(number for number, face in enumerate(FACES) if face.name == "down")
+    overlays[down] = overlay_of(operator_below(-44.0, "down"))
+    found = joined_overlays(FACES, overlays, 1)[front]
+    transmittance, addition = (layer.detach() for layer in found.layers())
+    hidden = operator_below(-44.0, "front")[..., 0] < 0.1
+    assert transmittance[hidden].mean() < 0.1
+    drops = torch.zeros(size, size, dtype=torch.bool)
+    drops[::5, ::5] = True
+    drops[size // 2 :] = False
+    assert transmittance[drops].min() > 0.98
+    assert (addition[drops] - 0.5).abs().max() < 0.01
+
+
 def test_a_face_keeps_what_is_known_of_its_own_photos():
     """Noise, where its artifact changes, and its lens's falloff, which is no artifact on either side of a border."""
     size = FACES[0].size

@@ -446,6 +446,10 @@ def test_it_says_so_where_the_artifact_hides_nothing_as_it_starts(train, capsys)
     assert "it has the same light in all photos" in capsys.readouterr().out
 
 
+def test_what_hides_beside_light_that_is_added_is_shaded(train):
+    assert train(steps=1, shading="affine", overlay_light="on").pipeline.model.shading is not None
+
+
 @pytest.mark.parametrize("downscale", [2, 4])
 def test_a_coarser_overlay_and_reduced_photos_have_the_same_light(train, varying_scene, downscale):
     trainer = train(steps=3, overlay_downscale=downscale, num_downscales=1)
