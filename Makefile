@@ -1,4 +1,4 @@
-# Everything runs in .venv, which is made when it is missing and brought up to date when pyproject.toml has changed.
+# All but `make bare` runs in .venv, which is made when it is missing and brought up to date when pyproject.toml has changed.
 #   make demo                  ssa run on the built-in scene behind a dashboard: a few minutes on two cores, no GPU
 #   make demo DATA=PHOTOS      ssa run on your photos, video or dataset
 #   make docs                  the documentation as a site, in site/

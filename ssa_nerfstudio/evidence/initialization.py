@@ -65,7 +65,7 @@ def estimate(
         opaque: [H, W] bool: where static edges enclose something opaque (`Detection.opaque`), which holds where no
             point says otherwise.
         static: [H, W] bool: where static edges are (`Detection.mask`): clear and opaque are equally likely there.
-        falloff: of the lens, [h, w, 1], if it is known; None: it is estimated from the samples.
+        falloff: [h, w, 1], if it is known; None: it is estimated from the samples.
         always_hiding: bool [h, w, 1], likewise: what is known to hide the scene in all photos; None: nothing.
     """
     reduction = working_reduction(*guide.shape[:2])

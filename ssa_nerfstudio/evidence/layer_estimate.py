@@ -44,8 +44,8 @@ CERTAIN_OPACITY = EVIDENCE_THRESHOLDS[0] * PRIOR_SCALE
 """Opacities above this are rarely noise, as edges of so many standard errors are: at most 1.0 % of the frame of four
 clean captures."""
 MIN_SHARE = 0.02
-"""Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges. What is found
-on less may be an error of the layers."""
+"""Share of the frame above CERTAIN_OPACITY from which on there is an artifact without static edges, and of a connected
+area that hides the scene. What is found on less may be an error of the layers."""
 LIGHT_SHARE = 1 / 3
 """Share of an artifact's light from which on it adds light: of what even white in place of the scene would not give. It
 is not all of it, because errors of T make some of it pass for light of what hides."""
@@ -60,7 +60,7 @@ class LayerEstimate:
     addition: Tensor
     """B [h, w, 3] in [0, 1]."""
     falloff: Tensor
-    """F [h, w, 1] in (0, 1]: of the lens, see `falloff.estimate_falloff`."""
+    """F [h, w, 1] in (0, 1], of a lens or a photo editor: see `falloff.estimate_falloff`."""
     unexplained: Tensor
     """[h, w, 1] in [0, 1]: share of the samples around a pixel that are outliers to these layers; NaN without any."""
     noise: Tensor = field(default_factory=lambda: torch.ones(()))

@@ -49,7 +49,7 @@ class ScreenSpaceOverlay(nn.Module):
     """r [h, w, 1] in [0, 1], small where the artifact was found: weight of the sparsity loss; below HIDDEN_BELOW the
     scene is known to be hidden (`composite`)."""
     falloff: Tensor
-    """F [h, w, 1] in (0, 1] of the lens (`evidence.falloff`); [1, 1, 1] of value 1 for none."""
+    """F [h, w, 1] in (0, 1] of a lens or a photo editor (`evidence.falloff`); [1, 1, 1] of value 1 for none."""
     reliable: Tensor
     """[h, w, 1] in [0, 1]: 0 where the artifact changes (`evidence.changing_area`), and the scene gets no gradient;
     [1, 1, 1] of value 1 for nowhere."""
@@ -198,7 +198,7 @@ class ScreenSpaceOverlay(nn.Module):
         return falloff * transmittance, falloff * addition
 
     def before_falloff(self, reduction: int = 1) -> tuple[Tensor, Tensor]:
-        """As `layers`, without the falloff of the lens: what is in front of the scene alone."""
+        """As `layers`, without the falloff: what is in front of the scene alone."""
         if self.adds_light:
             transmittance, addition = 1.0 - self.matte(), self.color()
         else:
@@ -209,7 +209,7 @@ class ScreenSpaceOverlay(nn.Module):
         return pair[..., :1], pair[..., 1:]
 
     def falloff_at(self, reduction: int = 1) -> Tensor:
-        """The falloff F of the lens [H // reduction, W // reduction, 1], in (0, 1]."""
+        """The falloff F [H // reduction, W // reduction, 1], in (0, 1]."""
         if self.falloff.numel() == 1:
             return self.falloff.expand(self.height // reduction, self.width // reduction, 1)
         return self._at_training_scale(self.falloff, reduction)

@@ -63,7 +63,7 @@ def start_beside_artifact(
     found = {overlay: _working_layers(overlay).to(device).split((4, 1), dim=-1) for overlay in overlays}
     shown = [artifacts.of_view(view) for view in range(len(samples))]
     layers = [None if overlay is None else found[overlay][0] for overlay in shown]
-    # A lens's falloff hides nothing: samples are divided by it.
+    # A falloff hides nothing: samples are divided by it.
     samples = [
         each if overlay is None else replace(each, color=each.color / found[overlay][1].reshape(-1, 1)[each.pixel])
         for each, overlay in zip(samples, shown, strict=True)
@@ -82,7 +82,7 @@ def start_beside_artifact(
 
 @torch.no_grad()
 def _working_layers(overlay: Overlay) -> Tensor:
-    """T and B before the lens's falloff, and the falloff, [h, w, 5], at the working size of point samples."""
+    """T and B before the falloff, and the falloff, [h, w, 5], at the working size of point samples."""
     if isinstance(overlay, ScreenSpaceOverlay):
         (transmittance, addition), falloff = overlay.before_falloff(), overlay.falloff_at()
     else:

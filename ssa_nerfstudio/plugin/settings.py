@@ -30,8 +30,8 @@ class ModelSettings(SplatfactoModelConfig):
     but only within static edges; statistics: W = mean of the photos, A = exp(-sigma / 0.05) (paper); constant: W = 0.5,
     A = 0.1 (paper's ablation)."""
     overlay_light: Literal["auto", "on", "off"] = "auto"
-    """Additive light (rain, glare), I = (1 - A) C + W: auto decides where overlay_start is points;
-    off is the paper's I = (1 - A) C + A W."""
+    """Additive light (rain, glare), I = (1 - A) C + W: auto decides where overlay_start is points, and what hides most
+    of the scene there starts with its matte (a dashboard in rain); off is the paper's I = (1 - A) C + A W."""
     overlay_intervals: Literal["auto", "off"] = "auto"
     """auto: where the artifact changes in the order of the photos, learn an overlay for each interval; off: one for all
     photos of a camera."""
