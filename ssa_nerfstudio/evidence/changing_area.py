@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ssa_nerfstudio.evidence.layer_estimate import MIN_OPACITY, MIN_SHARE, LayerEstimate, robust_deviation
 from ssa_nerfstudio.evidence.point_samples import PointSamples
-from ssa_nerfstudio.evidence.static_area import connected_parts
+from ssa_nerfstudio.evidence.static_area import parts_of_share
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 
 USUAL = 0.99
@@ -76,8 +76,7 @@ def moving_parts(estimate: LayerEstimate, samples: PointSamples) -> np.ndarray:
 def large_parts(estimate: LayerEstimate) -> Tensor:
     """Number the connected parts that hide more than half of the scene and cover MIN_SHARE of the frame: int64 [h, w],
     0 elsewhere."""
-    parts = connected_parts(estimate.opacity()[..., 0] > MIN_MEAN_OPACITY)
-    return torch.where(parts.flatten().bincount()[parts] < MIN_SHARE * parts.numel(), 0, parts)
+    return parts_of_share(estimate.opacity()[..., 0] > MIN_MEAN_OPACITY, MIN_SHARE)
 
 
 def _widened(area: np.ndarray) -> np.ndarray:

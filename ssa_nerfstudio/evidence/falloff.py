@@ -46,16 +46,37 @@ def estimate_falloff(samples: PointSamples, opaque: Tensor | None = None) -> Ten
     clear = shown.flatten()
     if clear.float().mean() < CLEAR_SHARE:
         return nothing
+    observed = _observed(samples, clear)
+    if observed is None:
+        return nothing
     # Round in front of the lens, or as wide and as high as the frame.
-    tests = [_test(samples, clear, stretch) for stretch in dict.fromkeys((samples.focal_ratio, width / height))]
+    tests = [_test(observed, stretch) for stretch in dict.fromkeys((samples.focal_ratio, width / height))]
     likeliest = min((test for test in tests if test is not None), key=lambda test: test.chance, default=None)
     # Bonferroni's correction: that one of two is significant is twice as likely.
     if likeliest is None or len(tests) * likeliest.chance >= SIGNIFICANCE:
         return nothing
-    log_transmittance = likeliest.log_transmittance(samples, clear)
+    log_transmittance = likeliest.log_transmittance(observed)
     if log_transmittance is None:
         return nothing
     return log_transmittance.exp().clamp(GRAY_LEVEL, 1).reshape(height, width, 1).to(samples.color)
+
+
+@dataclass(frozen=True)
+class _Observed:
+    """What regressions use of the samples: those at clear pixels. At others a patch may be of what is beside."""
+
+    size: tuple[int, int]
+    clear: Tensor
+    """Pixels that show the scene, bool [h w]."""
+    pixel: Tensor
+    """Of the samples, [S]."""
+    point: Tensor
+    """[S], of those that are observed, which are numbered anew."""
+    points: int
+    shown_by: Tensor
+    """[S, V]: 1 for a sample's view."""
+    log_brightness: Tensor
+    """log I of the samples, [S, 1]."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +94,8 @@ class _Test:
     freedom: int
     """Number of the other modes."""
 
-    def log_transmittance(self, samples: PointSamples, clear: Tensor) -> Tensor | None:
-        """Fit the modes by themselves: [h w], 0 on the mean of the clearest of the clear pixels [h w].
+    def log_transmittance(self, observed: _Observed) -> Tensor | None:
+        """Fit the modes by themselves: [h w], 0 on the mean of the clearest of the clear pixels.
 
         In a capture whose points move along few paths, the other modes take part of the falloff.
 
@@ -82,7 +103,7 @@ class _Test:
             None unless it darkens from the middle outwards, and the farther out the faster. A logo in the middle does
             not: outside of it nothing changes any more.
         """
-        coefficients = _regression(samples, self.modes, clear)
+        clear, coefficients = observed.clear, _regression(observed, self.modes)
         fitted = self.modes @ coefficients
         seen = fitted[clear]
         # Where nothing is seen the modes may be anything.
@@ -101,25 +122,25 @@ class _Test:
         return fitted - seen[seen >= fitted[least_clear]].mean() if faster & ~darker else None
 
 
-def _test(samples: PointSamples, clear: Tensor, stretch: float) -> _Test | None:
+def _test(observed: _Observed, stretch: float) -> _Test | None:
     """Test the modes that are radial where x is divided by `stretch`; None where clear pixels do not tell them apart.
 
     As wide and as high as the frame, a falloff may be squarer than an ellipse. What changes with the corners as much as
     with the radius, and so is less square, is none: four panels in the corners.
     """
-    height, width = samples.size
-    modes = _modes(height, width, stretch, clear)
+    height, width = observed.size
+    places = _places(height, width, stretch)
+    modes = _modes(places, observed.clear)
     if modes is None:
         return None
-    coefficients = _regression(samples, modes, clear)
+    coefficients = _regression(observed, modes)
     squarer = stretch == width / height and bool(coefficients[RADIAL_MODES] < 0)
     count = RADIAL_MODES + 1 if squarer else RADIAL_MODES
     chance = _chance(coefficients[:count], coefficients[count:])
     if not squarer and coefficients[RADIAL_MODES] > coefficients[:count].square().mean().sqrt():
         chance = 1.0
     error, freedom = coefficients[count:].square().mean().sqrt(), len(coefficients) - count
-    places = _places(height, width, stretch).to(modes.device)
-    return _Test(modes[:, :count], places, chance, error, freedom)
+    return _Test(modes[:, :count], places.to(modes.device), chance, error, freedom)
 
 
 def _chance(those: Tensor, others: Tensor) -> float:
@@ -138,11 +159,10 @@ def _places(height: int, width: int, stretch: float) -> Tensor:
     return torch.complex(*torch.broadcast_tensors(x / stretch, y[:, None])).flatten() / max(height, width)
 
 
-def _modes(height: int, width: int, stretch: float, clear: Tensor) -> Tensor | None:
-    """Polynomials of the position [h w, 17], float64, orthonormal over the clear pixels [h w]: r^2 to r^10, r^4 times
+def _modes(z: Tensor, clear: Tensor) -> Tensor | None:
+    """Polynomials [h w, 17] of places [h w], float64, orthonormal over the clear pixels [h w]: r^2 to r^10, r^4 times
     the cosine of four times the angle, and all others up to the fourth degree. None where these pixels do not tell them
     apart, as in tiny frames."""
-    z = _places(height, width, stretch)
     squared, seen = z.abs().square(), clear.cpu()
     radial = [squared**power for power in range(1, RADIAL_MODES + 1)]
     turning = [part for mode in (z, z**2, z * squared, z**3, z**2 * squared) for part in (mode.real, mode.imag)]
@@ -156,28 +176,33 @@ def _modes(height: int, width: int, stretch: float, clear: Tensor) -> Tensor | N
     return (modes * scale.sign()).to(clear.device)  # of the polynomials' own sign
 
 
-def _regression(samples: PointSamples, modes: Tensor, clear: Tensor) -> Tensor:
-    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, g of views, with Cauchy's weights, from the
-    samples at clear pixels [h w]: at others a patch may be of what is beside, but modes are extrapolated."""
+def _observed(samples: PointSamples, clear: Tensor) -> _Observed | None:
+    """Those of the samples that are used, given the clear pixels [h w]; None where none is."""
     # Of patches, because a point's own color changes with its distance.
     color = samples.color if samples.patch is None else samples.patch
     brightness, every = color.mean(dim=-1).double(), int(samples.view.max()) // MAX_VIEWS + 1
     usable = clear[samples.pixel] & (brightness < USABLE[1]) & (samples.view % every == 0)
     usable &= samples.point % (int(usable.sum()) // MAX_SAMPLES + 1) == 0
     if not usable.any():
-        return modes.new_zeros(modes.shape[1])
+        return None
     known, point = samples.point[usable].unique(return_inverse=True)
-    shown_by = torch.nn.functional.one_hot(samples.view[usable] // every)
-    columns = torch.cat([modes[samples.pixel[usable]], shown_by.to(modes)], dim=-1)
-    values = brightness[usable].clamp_min(GRAY_LEVEL).log()[:, None]
+    shown_by = torch.nn.functional.one_hot(samples.view[usable] // every).double()
+    log_brightness = brightness[usable].clamp_min(GRAY_LEVEL).log()[:, None]
+    return _Observed(samples.size, clear, samples.pixel[usable], point, len(known), shown_by, log_brightness)
+
+
+def _regression(observed: _Observed, modes: Tensor) -> Tensor:
+    """Coefficients [K] of modes [h w, K] in log I = log C + log g + modes, g of views, with Cauchy's weights."""
+    point, points, values = observed.point, observed.points, observed.log_brightness
+    columns = torch.cat([modes[observed.pixel], observed.shown_by], dim=-1)
     # The modes only need to be regular; gains are taken for none where nothing is known of them.
     damping = torch.full(columns.shape[1:], DAMPING, dtype=columns.dtype, device=columns.device)
     damping[: modes.shape[1]] = 1e-9
     weight, solution = torch.ones_like(values), torch.zeros_like(damping)
     for _ in range(ROUNDS):
-        total = summed(point, weight, len(known))
-        centered = columns - (summed(point, weight * columns, len(known)) / total)[point]
-        rest = values - (summed(point, weight * values, len(known)) / total)[point]
+        total = summed(point, weight, points)
+        centered = columns - (summed(point, weight * columns, points) / total)[point]
+        rest = values - (summed(point, weight * values, points) / total)[point]
         weighted = weight * centered
         solution = torch.linalg.solve(weighted.T @ centered + damping.diag(), weighted.T @ rest)
         rest -= centered @ solution

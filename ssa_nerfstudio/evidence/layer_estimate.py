@@ -19,7 +19,7 @@ from ssa_nerfstudio.evidence.first_colors import first_colors
 from ssa_nerfstudio.evidence.guided_upsampling import local_mean
 from ssa_nerfstudio.evidence.nearest_depths import OCCLUSION_RADIUS
 from ssa_nerfstudio.evidence.point_samples import PointSamples, summed
-from ssa_nerfstudio.evidence.static_area import connected_parts
+from ssa_nerfstudio.evidence.static_area import parts_of_share
 from ssa_nerfstudio.evidence.statistics import GRAY_LEVEL
 from ssa_nerfstudio.overlay.resampling import smallest_matte
 
@@ -87,10 +87,7 @@ class LayerEstimate:
     def hides(self) -> Tensor:
         """Where the artifact hides more of the scene than it shows, bool [h, w, 1]: connected areas of MIN_SHARE of the
         frame, because smaller ones may be errors of the layers."""
-        part = connected_parts(self.transmittance[..., 0] < 0.5)
-        large = part.flatten().bincount() >= MIN_SHARE * part.numel()
-        large[0] = False
-        return large[part][..., None]
+        return parts_of_share(self.transmittance[..., 0] < 0.5, MIN_SHARE)[..., None] > 0
 
     def adds_light(self, area: Tensor) -> bool:
         """Whether the artifact adds light: not what hides (`hides`), as a dashboard behind rain, but the rest of it.

@@ -84,6 +84,12 @@ def connected_parts(area: Tensor, connectivity: int = 8) -> Tensor:
     return torch.from_numpy(labels).to(area.device, torch.int64)
 
 
+def parts_of_share(area: Tensor, share: float) -> Tensor:
+    """Number those connected parts of an area, bool [h, w], that cover a share of the frame: int64 [h, w], else 0."""
+    parts = connected_parts(area)
+    return torch.where(parts.flatten().bincount()[parts] < share * parts.numel(), 0, parts)
+
+
 def _has_outline(outlines: np.ndarray, area: np.ndarray, usual: float) -> bool:
     """Whether at least half of an area's outline is edges: a uniform artifact has them, a uniform sky does not.
 

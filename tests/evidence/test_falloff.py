@@ -159,11 +159,12 @@ def test_a_falloff_between_black_bars_is_found_and_goes_no_further(outside: Tens
 def test_modes_are_orthonormal_over_what_is_seen() -> None:
     """Only then does the test compare squares of one variance."""
     clear = (X.abs() < 0.5).flatten()
-    modes = falloff._modes(HEIGHT, WIDTH, 1.1, clear)
+    modes = falloff._modes(falloff._places(HEIGHT, WIDTH, 1.1), clear)
     assert modes is not None
     torch.testing.assert_close(modes[clear].T @ modes[clear], torch.eye(17).double(), rtol=0, atol=1e-9)
     assert modes[clear].mean(dim=0).abs().max() < 1e-9
-    assert falloff._modes(HEIGHT, WIDTH, 1.1, torch.arange(HEIGHT * WIDTH) < 2 * WIDTH) is None, "two rows"
+    two_rows = torch.arange(HEIGHT * WIDTH) < 2 * WIDTH
+    assert falloff._modes(falloff._places(HEIGHT, WIDTH, 1.1), two_rows) is None
 
 
 def test_samples_at_opaque_pixels_do_not_count_though_their_patches_reach_beyond() -> None:
@@ -194,8 +195,10 @@ def test_two_hypotheses_share_the_level_of_significance(monkeypatch, chance: flo
 
 def test_a_mode_that_belongs_to_a_squarer_falloff_is_no_noise() -> None:
     clear = torch.ones(HEIGHT * WIDTH, dtype=torch.bool)
-    squarer = falloff._test(samples(OF_THE_FRAME["squarer"]), clear, WIDTH / HEIGHT)
-    lens = falloff._test(samples(FALLOFF), clear, 1.0)
+    observed = [falloff._observed(samples(each), clear) for each in (OF_THE_FRAME["squarer"], FALLOFF)]
+    assert observed[0] is not None
+    assert observed[1] is not None
+    squarer, lens = falloff._test(observed[0], WIDTH / HEIGHT), falloff._test(observed[1], 1.0)
     assert squarer is not None
     assert lens is not None
     assert (squarer.modes.shape[1], squarer.freedom) == (6, 11)
